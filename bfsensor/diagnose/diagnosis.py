@@ -35,7 +35,7 @@ from bfsensor.response.edge_response import LEVEL
 
 EXPANDED = 2
 """Largest number of times that a device is solved at its fitted quantities.  Chosen: each takes some
-13 CPU seconds a back bias; with 4, devices that are two spreads off in many quantities are not
+4 CPU seconds a back bias; with 4, devices that are two spreads off in many quantities are not
 predicted better."""
 
 STRAIGHT = 0.3
@@ -216,31 +216,25 @@ def _located(
 ) -> tuple[MeasuredChannels, Predictor, BaselineFit, Mismatch]:
     """Channels, the baseline's predictor and fit, and the residuals of the fit that stand out.
 
-    Where a device's residuals stand out, the device is solved at its fitted quantities and fitted
-    again, so that a straight line through its response is not taken for other physics.
+    A device is solved at its fitted quantities and fitted again, so that a straight line through its
+    response is not taken for other physics.
     """
-    for _ in range(EXPANDED + 1):
-        predictor, fit = fit_bounded(measured, baseline)
-        locate = locate_effects if explain else None
-        found = (
-            locate_mismatch(fit, seed=seed)
-            if locate is None
-            else locate(predictor, fit, seed=seed)
-        )
-        again = _expanded(baseline, fit) if found.detected else None
+    predictor, fit = fit_bounded(measured, baseline)
+    for _ in range(EXPANDED):
+        again = _expanded(baseline, fit)
         if again is None:
             break
         baseline = again
-    return measured, predictor, fit, found
+        predictor, fit = fit_bounded(measured, baseline)
+    if explain:
+        return measured, predictor, fit, locate_effects(predictor, fit, seed=seed)
+    return measured, predictor, fit, locate_mismatch(fit, seed=seed)
 
 
 def _far_from_solution(baseline: Baseline, fit: BaselineFit) -> bool:
     """Whether a device's fitted quantities are far from those that it was solved at."""
-    far = [
-        abs(fit.pulls[n] - baseline.expanded.get(n, 0.0))
-        for n in baseline.units
-        if n in fit.pulls
-    ]
+    solved = {} if baseline.curve is None else baseline.curve.pulls
+    far = [abs(fit.pulls[n] - solved.get(n, 0.0)) for n in baseline.units if n in fit.pulls]
     return baseline.solver is not None and max(far, default=0.0) >= STRAIGHT
 
 
@@ -256,13 +250,12 @@ def _not_expanded(baseline: Baseline, fit: BaselineFit) -> list[str]:
 
 
 def _expanded(baseline: Baseline, fit: BaselineFit) -> Baseline | None:
-    """Baseline linearised at its fitted quantities; None where that is no other one."""
+    """Baseline solved at its fitted quantities; None where that is no other one."""
     if not _far_from_solution(baseline, fit):
         return None
     pulls = {n: fit.pulls[n] for n in baseline.units if n in fit.pulls}
-    change = {n: p * baseline.spread[n] for n, p in pulls.items()}
     try:
-        return replace(expand_at(baseline, change), expanded=pulls)
+        return expand_at(baseline, pulls)
     except (DeviceError, ConvergenceError):
         return None
 

@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,29 @@ BY_FIELD = (
     "doping", "silicon.background_doping", "operating_point.back_bias", "vbb", "back_bias",
 )  # fmt: skip
 """Names of parameters that change only the drift field: see :meth:`Baseline.derivative`."""
+
+
+class Curve(NamedTuple):
+    """Change of shifts beyond first order in the parameters, from a solution at other values of them.
+
+    Attributes
+    ----------
+    pulls : mapping of str to float
+        Parameters of the solution, less their nominal values, over their spreads.
+    edges : mapping of (wavelength, back_bias) to (dkx, dky)
+        Shifts there less those by the derivatives [pixel/e-].
+    """
+
+    pulls: Mapping[str, float]
+    edges: Mapping[Key, Edges]
+
+    def share(self, pulls: Mapping[str, float]) -> float:
+        """Part of the change at other parameters: 1 at those of the solution, 0 at the nominal ones.
+
+        It is the square of the distance along the line between both.
+        """
+        along = sum(value * pulls.get(name, 0.0) for name, value in self.pulls.items())
+        return (along / sum(value**2 for value in self.pulls.values())) ** 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,8 +132,8 @@ class Baseline:
     """Parameters that stand for errors of the calculation, not for the device."""
     solver: DeviceSolver | None = None
     """Solver of the device with another value of a quantity; None where the baseline is no device."""
-    expanded: Mapping[str, float] = field(default_factory=dict)
-    """Pulls of the parameters at which the shifts were solved and linearised; 0 for all others."""
+    curve: Curve | None = None
+    """Change of the shifts beyond first order, where the device was solved again."""
 
     def __post_init__(self) -> None:
         if not self.edges:
@@ -133,12 +156,14 @@ class Baseline:
             self.name, self.reference, self.not_below, self.accuracy, self.level, self.temperature,
             self.spots_bend, sorted(self.bounds.items()), sorted(self.spread.items()),
             sorted(self.nominal.items()),
+            [] if self.curve is None else sorted(self.curve.pulls.items()),
             sorted(self.card.items(), key=str), [str(p) for p in self.pieces],
             sorted(self.units.items()), "" if self.solver is None else self.solver.text,
         )  # fmt: skip
         tables: dict[str, Mapping[Any, Edges]] = {
             "edges": self.edges, "slopes": self.slopes, "bends": self.bends,
             "warming": self.warming, "derivatives": self.derivatives,
+            "curve": {} if self.curve is None else self.curve.edges,
             **{str(key): of_key for key, of_key in self.held.items()},
         }  # fmt: skip
         arrays = [
@@ -235,6 +260,10 @@ class Baseline:
             dkx, dky = self.derivative(name, key)
             kx = kx + value * dkx
             ky = ky + value * dky
+        if change and self.curve is not None and key in self.curve.edges:
+            share = self.curve.share({n: v / self.spread[n] for n, v in change.items()})
+            dkx, dky = self.curve.edges[key]
+            kx, ky = kx + share * dkx, ky + share * dky
         return (kx, ky), exact
 
     def derivative(self, name: str, key: Key) -> Edges:

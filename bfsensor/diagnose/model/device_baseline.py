@@ -13,7 +13,7 @@ import numpy as np
 from bfsensor.device.device import Device
 from bfsensor.device.parameters import change_parameter, device_parameters
 from bfsensor.device.quantities import quantities
-from bfsensor.diagnose.model.baseline import Baseline, Key
+from bfsensor.diagnose.model.baseline import Baseline, Curve, Key
 from bfsensor.diagnose.model.cached_response import Walk, walk
 from bfsensor.diagnose.model.device_solver import BACKGROUNDS, COARSE, FINE, DeviceSolver
 from bfsensor.diagnose.model.mesh_error import FINEST, mesh_errors, part_of
@@ -198,21 +198,21 @@ def baseline_of_device(
     )  # fmt: skip
 
 
-def expand_at(baseline: Baseline, change: Mapping[str, float]) -> Baseline:
-    """Solve a baseline's device at fitted values of its parameters, and linearise it there.
+def expand_at(baseline: Baseline, pulls: Mapping[str, float]) -> Baseline:
+    """Solve a baseline's device at fitted values of its parameters as well.
 
     Parameters
     ----------
     baseline : Baseline
         From :func:`baseline_of_device`, with its solver.
-    change : mapping of str to float
-        Parameters less their nominal values, in their units.
+    pulls : mapping of str to float
+        Parameters less their nominal values, over their spreads.
 
     Returns
     -------
     Baseline
-        The same parameters about the same nominal values; its shifts are those of the solutions at
-        the fitted values, to first order about these.
+        Its shifts are those of the solutions at the nominal and, by the change on 32 cells, at the
+        fitted values, with the same derivatives at the nominal ones.
 
     Raises
     ------
@@ -221,28 +221,14 @@ def expand_at(baseline: Baseline, change: Mapping[str, float]) -> Baseline:
     """
     solver = baseline.solver
     assert solver is not None
-    kelvin = solver.device.operating_point.temperature
-    known = quantities(solver.device)
-    spreads = {n: baseline.spread[n] / known[n].number(1.0) for n in change}
-    values = {n: baseline.nominal[n] + by for n, by in change.items()}
-    edges = dict(baseline.edges)
-    held = {key: dict(of_key) for key, of_key in baseline.held.items()}
-    for bias in solver.biases:
-        here = solver.device_with(values, bias)
-        found = walk(here, cells=FINEST, keep=solver.keep)
-        slopes = _derivatives(here, spreads)
-        for w in solver.wavelengths:
-            colour = w if solver.depths else None
-            kx, ky = found.edges(colour, kelvin)
-            dkx, dky = mixed(slopes.dkx, slopes.dky, slopes.depths, colour, kelvin)
-            for n, name in enumerate(spreads):
-                per = known[name].number(1.0)
-                held[w, bias][name] = own = dkx[n] / per, dky[n] / per
-                kx, ky = kx - change[name] * own[0], ky - change[name] * own[1]
-            edges[w, bias] = kx, ky
-    first = held[baseline.reference]
-    derivatives = {n: first.get(n, old) for n, old in baseline.derivatives.items()}
-    return replace(baseline, edges=edges, held=held, derivatives=derivatives)
+    change = {n: p * baseline.spread[n] for n, p in pulls.items()}
+    more = solver.changed({n: baseline.nominal[n] + by for n, by in change.items()})
+    for key, (kx, ky) in more.items():
+        for name, by in change.items():
+            dkx, dky = baseline.derivative(name, key)
+            kx, ky = kx - by * dkx, ky - by * dky
+        more[key] = kx, ky
+    return replace(baseline, curve=Curve(dict(pulls), more))
 
 
 def _derivatives(device: Device, spreads: Mapping[str, float]) -> EdgeResponse:

@@ -142,13 +142,17 @@ class DeviceSolver:
         slopes: list[tuple[Key, Edges]] = []
         bends: list[tuple[Key, Edges]] = []
         for bias in self.biases:
-            new, old = self._both(name, value, bias, cells, (LEVEL,))
+            pair = (
+                self.device_at(name, value, bias),
+                self.device_at(name, self.nominal(name), bias),
+            )
+            new, old = self._both(*pair, cells, (LEVEL,))
             for w, colour in self._colours():
                 edges.append(
                     ((w, bias), less(new.edges(colour, kelvin), old.edges(colour, kelvin)))
                 )
             if levels and self.levels:
-                new, old = self._both(name, value, bias, COARSE, BACKGROUNDS)
+                new, old = self._both(*pair, COARSE, BACKGROUNDS)
                 for w, colour in self._colours():
                     (s, b), (s0, b0) = new.bent(colour, kelvin), old.bent(colour, kelvin)
                     slopes.append(((w, bias), less(s, s0)))
@@ -160,20 +164,30 @@ class DeviceSolver:
         """Wavelengths, and what light of each is simulated by; None: it converts at the back."""
         return [(w, w if self.depths else None) for w in self.wavelengths]
 
+    def changed(self, values: Mapping[str, float]) -> dict[Key, Edges]:
+        """Change of the shifts by several quantities at given values, at all conditions.
+
+        Raises
+        ------
+        DeviceError, ConvergenceError
+            There is no such device, or it could not be solved.
+        """
+        kelvin = self.device.operating_point.temperature
+        out = {}
+        for bias in self.biases:
+            pair = self.device_with(values, bias), self.device_with({}, bias)
+            new, old = self._both(*pair, FINE, (LEVEL,))
+            for w, colour in self._colours():
+                out[w, bias] = less(new.edges(colour, kelvin), old.edges(colour, kelvin))
+        return out
+
     def _both(
-        self,
-        name: str,
-        value: float,
-        bias: float,
-        cells: int,
-        backgrounds: tuple[float, ...],
+        self, new: Device, old: Device, cells: int, backgrounds: tuple[float, ...]
     ) -> tuple[Walk, Walk]:
         """Response of the changed and of the nominal device, on one mesh where it can be moved."""
-        old = self.device_at(name, self.nominal(name), bias)
-        new = self.device_at(name, value, bias)
         solve = partial(walk, cells=cells, backgrounds=backgrounds, keep=self.keep)
         plain = solve(old)
-        if name == PHASES:
+        if new.gates.collecting_phases != old.gates.collecting_phases:
             return solve(new), plain
         try:
             return solve(new, laid_for=old), plain

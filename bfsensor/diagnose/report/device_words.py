@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 from bfsensor.device.quantities import describe
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.diagnose.model.unknown_level import NAME as LEVEL
 from bfsensor.diagnose.report.class_words import said_number, said_p
+from bfsensor.effects.device_parameter import FARTHEST
 
 SAID = 0.1
 """Probability, that any quantity is as far off by chance, below which the farthest one is stated in
@@ -39,15 +40,18 @@ class FittedQuantity:
         The unit; '' where it is not known.
     pull, pull_error : float
         Fitted less nominal value, and its standard error, over the prior's width.
+    alone, alone_error : float
+        Value by the recordings and the priors of all other quantities, within what it can be, and its
+        standard error, in the unit of device files.
     gain : float
-        Decrease of the chi-square if the prior of this quantity is left out:
-        pull^2 / (1 - pull_error^2), which for a device within its file is a chi-square of one degree of
-        freedom.
+        Decrease of the chi-square at that value if the prior of this quantity is left out; for a
+        device within its file at most a chi-square of one degree of freedom.
     p_value : float
         Probability that any of all quantities gains as much by chance (Bonferroni's bound).
     odds : float
-        Odds that this quantity is anywhere within what it can be, against one within its
-        uncertainty, all others within theirs; nan where its range is not bounded.
+        Odds that this quantity is anywhere within what it can be, at most
+        :data:`~bfsensor.effects.device_parameter.FARTHEST` uncertainties off, against one within its
+        uncertainty, all others within theirs.
     """
 
     name: str
@@ -57,6 +61,8 @@ class FittedQuantity:
     unit: str
     pull: float
     pull_error: float
+    alone: float
+    alone_error: float
     gain: float
     p_value: float
     odds: float
@@ -93,17 +99,23 @@ def fitted_quantities(fit: BaselineFit, baseline: Baseline) -> list[FittedQuanti
     for name, pull in pulls.items():
         width, error = baseline.spread[name], float(errors[f"device {name}"])
         nominal = baseline.nominal.get(name, np.nan)
-        # A parameter that the recordings do not constrain has the error of its prior.
-        free = max(1 - error**2, 1e-12)
-        gain = pull**2 / free if error < 1 else 0.0
-        low, high = baseline.bounds.get(name, (-np.inf, np.inf))
-        range_ = (high - low) / width
-        odds = np.sqrt(2 * np.pi / free) * np.exp(min(gain / 2, 500.0)) / range_
+        # The prior is a datum with the residual ``pull`` and the leverage ``error**2``; a
+        # parameter that the recordings do not constrain has the error of its prior.
+        free = max(1 - error**2, 1e-9)
+        middle, scatter = pull / free, error / np.sqrt(free)
+        ends = np.array(baseline.bounds.get(name, (-np.inf, np.inf))) / width
+        low, high = np.clip(ends, -FARTHEST, FARTHEST)
+        alone = float(np.clip(middle, low, high))
+        lost = ((alone - middle) / scatter) ** 2
+        gain = max(pull**2 / free - lost, 0.0)
+        inside = norm.cdf((high - middle) / scatter) - norm.cdf((low - middle) / scatter)
+        within = norm.pdf(middle, scale=np.sqrt(1 + scatter**2))
         q = FittedQuantity(
             name=name, value=nominal + pull * width, error=error * width, nominal=nominal,
-            unit=baseline.units.get(name, ""), pull=pull, pull_error=error, gain=gain,
+            unit=baseline.units.get(name, ""), pull=pull, pull_error=error,
+            alone=nominal + alone * width, alone_error=scatter * width, gain=gain,
             p_value=min(1.0, len(pulls) * float(chi2.sf(gain, 1))),
-            odds=float(odds) if np.isfinite(range_) else np.nan,
+            odds=float(inside / (high - low) / max(within, 1e-300)),
         )  # fmt: skip
         out.append(q)
     return sorted(out, key=lambda q: -q.gain)
@@ -128,17 +140,17 @@ def said_farthest(found: Sequence[FittedQuantity]) -> str:
     unit = f" {first.unit}" if first.unit else ""
     if np.isfinite(first.nominal):
         value = (
-            f"{_named(first.name)} is {said_number(first.value)} +- "
-            f"{said_number(first.error, 2)}{unit}, nominally {said_number(first.nominal)}{unit}, "
+            f"{_named(first.name)} is {said_number(first.alone)} +- "
+            f"{said_number(first.alone_error, 2)}{unit} by the recordings, nominally "
+            f"{said_number(first.nominal)}{unit}"
         )
     else:
-        value = f"{first.name} is off by "
+        value = f"{first.name}, by {first.pull:+.1f} +- {first.pull_error:.1g} of its uncertainties"
     text = (
-        f"Farthest from the device's file: {value}{first.pull:+.1f} +- {first.pull_error:.1g} of its "
-        f"uncertainties; that any of {len(found)} quantities is as far by chance has probability "
-        f"{said_p(first.p_value)}."
+        f"Farthest from the device's file: {value}; that any of {len(found)} quantities is as far by "
+        f"chance has probability {said_p(first.p_value)}."
     )
-    if np.isfinite(first.odds) and first.odds > 1:
+    if first.odds > 1:
         text += (
             f" That it is anywhere within what it can be is {said_number(first.odds, 2)} times as "
             "likely as that all quantities are within their uncertainties."

@@ -8,7 +8,8 @@ import pytest
 from bfsensor import Device
 from bfsensor.device.condition import Condition
 from bfsensor.diagnose import diagnosis
-from bfsensor.diagnose.model import device_baseline
+from bfsensor.diagnose.model import device_baseline, device_solver
+from bfsensor.diagnose.model.baseline import Curve
 from bfsensor.diagnose.model.cached_response import Walk
 from bfsensor.diagnose.model.device_baseline import baseline_of_device, expand_at
 from bfsensor.errors import DeviceError
@@ -37,33 +38,43 @@ def baseline(monkeypatch):
         )
 
     monkeypatch.setattr(device_baseline, "walk", walk)
+    monkeypatch.setattr(device_solver, "walk", walk)
     monkeypatch.setattr(device_baseline, "solve_response", solve)
     return baseline_of_device(Device.load("itl_sta3800c"), parameters=[NAME])
 
 
-def test_shifts_are_those_of_the_device_at_its_fitted_quantities(baseline):
+def test_shifts_are_those_of_the_device_at_nominal_and_fitted_quantities(baseline):
     truth = 1e-9 * 18.0**2
     straight = baseline.at(HERE, {NAME: 8.0})[0][0][2, 2]
     assert straight == pytest.approx(1e-9 * (10.0**2 + 2 * 10.0 * 8.0), rel=1e-3)
-    moved = expand_at(baseline, {NAME: 8.0})
+    moved = expand_at(baseline, {NAME: 8.0 / baseline.spread[NAME]})
     assert moved.at(HERE, {NAME: 8.0})[0][0][2, 2] == pytest.approx(truth, rel=1e-3)
-    # It is the tangent there, about the same nominal value and with the same prior.
-    near = moved.at(HERE, {NAME: 9.0})[0][0][2, 2]
-    assert near - truth == pytest.approx(1e-9 * 2 * 18.0, rel=1e-3)
+    assert moved.at(HERE, None)[0][0][2, 2] == baseline.at(HERE)[0][0][2, 2]
+    # A parabola through both, which this response is.
+    near = moved.at(HERE, {NAME: 5.0})[0][0][2, 2]
+    assert near == pytest.approx(1e-9 * 15.0**2, rel=1e-3)
     assert moved.nominal == baseline.nominal and moved.spread == baseline.spread
+    assert moved.digest != baseline.digest
+
+
+def test_curve_is_along_the_line_to_the_solution():
+    curve = Curve({"a": 2.0, "b": 1.0}, {})
+    assert curve.share({"a": 1.0, "b": 0.5}) == pytest.approx(0.25)
+    # At right angles to the line nothing is known but the derivatives.
+    assert curve.share({"a": 1.0, "b": -2.0}) == pytest.approx(0.0)
 
 
 def test_small_pulls_and_devices_without_a_solution_stay_as_they_are(baseline, monkeypatch):
     assert diagnosis._expanded(baseline, SimpleNamespace(pulls={NAME: 0.2})) is None
     once = diagnosis._expanded(baseline, SimpleNamespace(pulls={NAME: 1.6}))
-    assert once.expanded == {NAME: 1.6}
+    assert once.curve.pulls == {NAME: 1.6}
     assert diagnosis._expanded(once, SimpleNamespace(pulls={NAME: 1.5})) is None
     assert diagnosis._expanded(once, SimpleNamespace(pulls={NAME: 2.5})) is not None
 
     def refuse(*_, **__):
         raise DeviceError("not depleted")
 
-    monkeypatch.setattr(device_baseline, "walk", refuse)
+    monkeypatch.setattr(device_solver, "walk", refuse)
     assert diagnosis._expanded(baseline, SimpleNamespace(pulls={NAME: 1.6})) is None
 
 

@@ -58,6 +58,8 @@ def test_gain_is_that_of_leaving_out_the_prior(baseline):
         free = replace(baseline, spread={**baseline.spread, q.name: 1e4 * 0.01})
         without = fit_bounded(measured, free)[1]
         assert q.gain == pytest.approx(fit.total - without.total, rel=1e-3, abs=1e-6)
+        pull = without.pulls[q.name] * 1e4
+        assert q.alone == pytest.approx(1 + 0.01 * pull, rel=1e-5)
 
 
 def test_farthest_quantity_is_said_in_its_unit_whether_or_not_there_is_an_alarm(baseline):
@@ -65,9 +67,21 @@ def test_farthest_quantity_is_said_in_its_unit_whether_or_not_there_is_an_alarm(
     result = diagnose_measured(measured, baseline, explain=False)
     said = result.said()
     assert "background doping (silicon.background_doping) is 1.03 +- " in said
-    assert "um, nominally 1 um, +" in said and "times as likely" in said
+    assert "um by the recordings, nominally 1 um;" in said and "times as likely" in said
     first = result.to_report()["device"][0]
     assert first["value"] == pytest.approx(1.03, abs=0.003) and first["nominal"] == 1.0
+
+
+def test_value_that_cannot_be_is_not_stated(baseline):
+    """A quantity that would explain the rest far beyond its range gains less by it."""
+    weak = {n: tuple(0.002 * k for k in d) for n, d in baseline.derivatives.items()}
+    weak |= {NAMES[1]: baseline.derivatives[NAMES[1]]}
+    measured = measure_reduced(table((0.001, 0.0, 0.0)), reach=baseline.reach)
+    narrow = replace(baseline, derivatives=weak)
+    predictor, fit = fit_bounded(measured, narrow)
+    found = {q.name: q for q in fitted_quantities(fit, predictor.baseline)}[NAMES[0]]
+    assert found.pull_error > 0.9 and found.alone == pytest.approx(1 + 16 * 0.01)
+    assert 0 < found.gain < found.pull**2 / (1 - found.pull_error**2)
 
 
 def test_device_within_its_file_is_not_said(baseline):
