@@ -24,7 +24,7 @@ from bfsensor.diagnose.fit.baseline_fit import (
 )
 from bfsensor.diagnose.fit.error_scale import scale_errors
 from bfsensor.diagnose.model.baseline import Baseline
-from bfsensor.diagnose.model.device_baseline import expand_at
+from bfsensor.diagnose.model.device_baseline import STRAIGHT, expand_at, far_from_solution
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.diagnose.model.unknown_level import NAME as LEVEL_NAME
 from bfsensor.diagnose.model.unknown_level import float_unknown_level
@@ -33,14 +33,10 @@ from bfsensor.diagnose.report.diagnosis_result import Diagnosis
 from bfsensor.errors import ConvergenceError, DeviceError
 from bfsensor.response.edge_response import LEVEL
 
-EXPANDED = 2
+EXPANDED = 4
 """Largest number of times that a device is solved at its fitted quantities.  Chosen: each takes some
-4 CPU seconds a back bias; with 4, devices that are two spreads off in many quantities are not
-predicted better."""
-
-STRAIGHT = 0.3
-"""Change of a fitted quantity [spread of its prior] below which its response is taken as straight.
-Chosen: with 0.6, the error of a curved response is four times as large."""
+4 CPU seconds a back bias, and devices two spreads off in many quantities take two; with 8, one that is
+hard to predict takes a minute more."""
 
 
 # Threads of the linear algebra take 1.7 times the CPU seconds and no less time: matrices are small.
@@ -178,7 +174,7 @@ def diagnose_measured(
         *_of_level(baseline, fit),
         *_as_stated(stated, measured, baseline, seed),
         *(_symmetries(fit) if mismatch.detected else []),
-        *(_not_expanded(predictor.baseline, fit) if mismatch.detected else []),
+        *_not_expanded(predictor.baseline, fit),
     ]
     attribution, advised = None, RecordingPlan()
     if mismatch.detected and explain:
@@ -231,27 +227,21 @@ def _located(
     return measured, predictor, fit, locate_mismatch(fit, seed=seed)
 
 
-def _far_from_solution(baseline: Baseline, fit: BaselineFit) -> bool:
-    """Whether a device's fitted quantities are far from those that it was solved at."""
-    solved = {} if baseline.curve is None else baseline.curve.pulls
-    far = [abs(fit.pulls[n] - solved.get(n, 0.0)) for n in baseline.units if n in fit.pulls]
-    return baseline.solver is not None and max(far, default=0.0) >= STRAIGHT
-
-
 def _not_expanded(baseline: Baseline, fit: BaselineFit) -> list[str]:
     """Note on a device that is predicted by derivatives far from where it was solved."""
-    if not _far_from_solution(baseline, fit):
+    if not far_from_solution(baseline, fit.pulls):
         return []
     return [
         "fitted quantities of the device are more than "
         f"{STRAIGHT:g} of their uncertainties from where it was solved, as no such device could be "
-        f"solved or {EXPANDED} solutions did not settle: a curved response may look like other physics"
+        f"solved or {EXPANDED} solutions did not settle: a curved response may look like other physics, "
+        "and no quantity is stated"
     ]
 
 
 def _expanded(baseline: Baseline, fit: BaselineFit) -> Baseline | None:
     """Baseline solved at its fitted quantities; None where that is no other one."""
-    if not _far_from_solution(baseline, fit):
+    if not far_from_solution(baseline, fit.pulls):
         return None
     pulls = {n: fit.pulls[n] for n in baseline.units if n in fit.pulls}
     try:

@@ -48,6 +48,10 @@ VOLTAGES = {
 errors, from which fits begin.  Chosen, as in the fits of the a_ij of 2019: with twice the errors fits
 begin twice as far off."""
 
+STRAIGHT = 0.3
+"""Change of a fitted quantity [spread of its prior] below which its response is taken as straight.
+Chosen: with 0.6, the error of a curved response is four times as large."""
+
 PARTS = ("levels", "depths")
 """Parts of the physics that a baseline can be calculated without: change with level, and depths."""
 
@@ -196,6 +200,21 @@ def baseline_of_device(
         units={n: solver.unit(n) for n in chosen}, solver=solver,
         bounds={n: (low - nominal[n], high - nominal[n]) for n, (low, high) in ends.items()},
     )  # fmt: skip
+
+
+def far_from_solution(baseline: Baseline, pulls: Mapping[str, float]) -> bool:
+    """Whether fitted quantities of a device are far from those that it was solved at.
+
+    Parameters
+    ----------
+    baseline : Baseline
+        Any; only a device that can be solved is ever far.
+    pulls : mapping of str to float
+        Parameters less their nominal values, over their spreads.
+    """
+    solved = {} if baseline.curve is None else baseline.curve.pulls
+    far = [abs(pulls[n] - solved.get(n, 0.0)) for n in baseline.units if n in pulls]
+    return baseline.solver is not None and max(far, default=0.0) >= STRAIGHT
 
 
 def expand_at(baseline: Baseline, pulls: Mapping[str, float]) -> Baseline:

@@ -19,6 +19,7 @@ from bfsensor.diagnose.detect.scans import DEVICE, DEVICE_SEEN
 from bfsensor.diagnose.explain.attribution import Attribution
 from bfsensor.diagnose.explain.location import place_effects
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
+from bfsensor.diagnose.model.device_baseline import far_from_solution
 from bfsensor.diagnose.model.predictor import Predictor, used_channels
 from bfsensor.diagnose.plan.advice import RecordingPlan
 from bfsensor.diagnose.plan.gaps import find_untested
@@ -245,9 +246,9 @@ class Diagnosis:
                 parts.append(f"It is also seen in: {', '.join(others)}.")
             if self.attribution is not None:
                 parts += said_of(self.attribution)
-        farthest = said_farthest(self.quantities)
-        if farthest:
-            parts.append(farthest)
+        predictor, fit = self.accepted
+        if predictor is not None and not far_from_solution(predictor.baseline, fit.pulls):
+            parts += [said for said in [said_farthest(self.quantities)] if said]
         return " ".join(parts)
 
     def _elsewhere(self, first: Finding) -> list[str]:
