@@ -9,7 +9,9 @@ import numba
 import numpy as np
 
 from bfsensor._kernels.compile_options import ENTRY, INLINED, INNER
+from bfsensor._kernels.extremes import max, min
 from bfsensor._kernels.photons import _at, fixed_shift, ring_shift
+from bfsensor._kernels.shifts import MODES, NEAR_MODES
 from bfsensor._kernels.window import add_8_kernels
 
 GAUSS = 0.5 - 0.5 / np.sqrt(3.0)
@@ -45,8 +47,19 @@ def _add_rows(weights, start, lanes, rows, columns, charges, at, stride, out, co
             c += 1
 
 
+@numba.njit(**INNER, fastmath={"contract"})
+def _add_near(weights, start, rows, columns, charges, at, stride, out, count):
+    """Add to ``out`` as :func:`_add_rows`, where all modes of a pixel lie side by side."""
+    for r in range(rows):
+        for c in range(NEAR_MODES * columns):
+            a = weights[np.uint64(start + 16 * r + c)]
+            q = np.uint64(NEAR_MODES * (at + r * stride) + c)
+            for n in range(np.uint64(count)):
+                out[n] += a * charges[q + np.uint64(NEAR_MODES) * n]
+
+
 @numba.njit(**INNER)
-def _line_shifts(edges, charges, upright, layer, point, line, low, low_second, out):
+def _line_shifts(edges, charges, upright, layer, point, line, lows, out):
     """Shifts (x, y) of one point of every side of a row; ``line``: row or line."""
     q = edges.reach
     side = 0 if upright else 1
@@ -54,10 +67,10 @@ def _line_shifts(edges, charges, upright, layer, point, line, low, low_second, o
     for component in range(2):
         to = out[component if upright else 1 - component]
         place = (layer * 2 + component) * edges.points.size + point
-        total = 2 * (side * edges.layers * edges.points.size * 2 + place)
-        constant = -edges.sums[total] * low
-        if edges.modes == 2:
-            constant -= edges.sums[total + 1] * low_second
+        total = MODES * (side * edges.layers * edges.points.size * 2 + place)
+        constant = -edges.sums[total] * lows[0]
+        for m in range(1, edges.modes):
+            constant -= edges.sums[total + m] * lows[m]
         for n in range(count):
             to[n] = constant
         row = line - q - side
@@ -70,18 +83,17 @@ def _line_shifts(edges, charges, upright, layer, point, line, low, low_second, o
             (row + charges.pad) * charges.stride + column + charges.pad, charges.stride,
             to, count,
         )  # fmt: skip
-        if edges.modes == 2:
-            _add_rows(
-                edges.weights, edges.starts[2 + side] + place * (3 + side) * 8, 8,
-                3 + side, 4 - side, charges.second,
+        if edges.modes > 1:
+            _add_near(
+                edges.weights, edges.starts[2 + side] + place * (3 + side) * 16,
+                3 + side, 4 - side, charges.near,
                 (line - 1 - side + charges.pad) * charges.stride + side - 2 + charges.pad,
                 charges.stride, to, count,
             )  # fmt: skip
 
 
 @numba.njit(**INNER)
-def _integrate(edges, charges, pattern, flux, upright, line, low, low_second, now, before,
-               out):  # fmt: skip
+def _integrate(edges, charges, pattern, flux, upright, line, lows, now, before, out):
     """Integral of y dx along every side of a row, and its ends.
 
     ``out`` [5, sides]: the integral about the nominal place of the line (of the row's
@@ -94,9 +106,7 @@ def _integrate(edges, charges, pattern, flux, upright, line, low, low_second, no
         out[0, n] = 0.0
     for point in range(last + 1):
         if flux:
-            _line_shifts(
-                edges, charges, upright, edges.layers - 1, point, line, low, low_second, now
-            )
+            _line_shifts(edges, charges, upright, edges.layers - 1, point, line, lows, now)
         else:
             for n in range(count):
                 now[0, n] = 0.0
@@ -140,11 +150,11 @@ def _join(x0, y0, x1, y1):
 
 
 @numba.njit(**{**ENTRY, "_nrt": True})
-def pixel_areas(edges, charges, pattern, flux, low, low_second, first_row, last_row, out):
+def pixel_areas(edges, charges, pattern, flux, lows, first_row, last_row, out):
     """Write the areas [nominal area] of the rows ``first_row`` to ``last_row`` to ``out`` [ny, nx].
 
-    ``low`` and ``low_second`` are subtracted from the charges, for a uniform charge moves no
-    boundary.  With ``flux`` False only the fixed pattern moves boundaries.
+    ``lows`` are subtracted from the charges by mode, for a uniform charge moves no boundary.  With
+    ``flux`` False only the fixed pattern moves boundaries.
     """
     nx = charges.nx
     now = np.zeros((2, nx + 1), np.float32)
@@ -152,17 +162,11 @@ def pixel_areas(edges, charges, pattern, flux, low, low_second, first_row, last_
     bottom = np.zeros((5, nx + 1))
     top = np.zeros((5, nx + 1))
     sides = np.zeros((5, nx + 1))
-    _integrate(
-        edges, charges, pattern, flux, False, first_row, low, low_second, now, before, top
-    )
+    _integrate(edges, charges, pattern, flux, False, first_row, lows, now, before, top)
     for j in range(first_row, last_row):
         bottom[:] = top
-        _integrate(
-            edges, charges, pattern, flux, False, j + 1, low, low_second, now, before, top
-        )
-        _integrate(
-            edges, charges, pattern, flux, True, j, low, low_second, now, before, sides
-        )
+        _integrate(edges, charges, pattern, flux, False, j + 1, lows, now, before, top)
+        _integrate(edges, charges, pattern, flux, True, j, lows, now, before, sides)
         for i in range(nx):
             # Counter-clockwise about the pixel's middle: bottom, right, top, left.
             around = bottom[0, i] - 0.5 * (1.0 + bottom[3, i] - bottom[1, i])
@@ -191,13 +195,45 @@ def pixel_areas(edges, charges, pattern, flux, low, low_second, first_row, last_
 
 
 @numba.njit(**ENTRY)
+def charge_ranges(charges, lows, highs):
+    """Write the lowest and the highest effective charge in the image, by mode."""
+    modes = MODES if charges.near.size > 0 else 1
+    for m in range(MODES):
+        lows[m] = np.float32(np.inf) if m < modes else np.float32(0.0)
+        highs[m] = np.float32(-np.inf) if m < modes else np.float32(0.0)
+    for j in range(charges.ny):
+        start = np.uint64((j + charges.pad) * charges.stride + charges.pad)
+        for i in range(np.uint64(charges.nx)):
+            value = charges.first[start + i]
+            lows[0] = min(lows[0], value)
+            highs[0] = max(highs[0], value)
+        for m in range(np.uint64(modes - 1)):
+            low, high = lows[np.uint64(1) + m], highs[np.uint64(1) + m]
+            for i in range(np.uint64(charges.nx)):
+                value = charges.near[np.uint64(NEAR_MODES) * (start + i) + m]
+                low = min(low, value)
+                high = max(high, value)
+            lows[np.uint64(1) + m] = low
+            highs[np.uint64(1) + m] = high
+
+
+@numba.njit(**INNER)
+def _take_rows(charges, first, last, planes):
+    """Copy rows of the near modes to ``planes`` [modes, pixels], one mode after the other."""
+    start = np.uint64(first * charges.stride)
+    for n in range(np.uint64((last - first) * charges.stride)):
+        for m in range(np.uint64(NEAR_MODES)):
+            planes[m, n] = charges.near[np.uint64(NEAR_MODES) * (start + n) + m]
+
+
+@numba.njit(**ENTRY)
 def convolved_areas(
     charges,
+    planes,
     first,
-    second,
+    near,
     values,
-    low,
-    low_second,
+    lows,
     bottom,
     top,
     left,
@@ -210,29 +246,39 @@ def convolved_areas(
 
     Only the rows ``bottom`` to ``top`` and the columns ``left`` to ``right`` are written.
 
-    ``first`` [groups, width, width, 8] and ``second`` (5 x 5; width 0: none) are kernels, eight side by
-    side, of which the very first is the linear one; the squares of the other sums are added with
-    the factors ``values`` [groups, 8].  ``sums`` [9, 16] is scratch, of the type of the kernels.
+    ``first`` [groups, width, width, 8] and ``near`` [groups, modes (0: none), 5, 5, 8] are kernels,
+    eight side by side, of which the very first is the linear one; the squares of the other sums are
+    added with the factors ``values`` [groups, 8], and ``lows`` subtracted from the charges.  ``sums``
+    [9, 16] is scratch, of the type of the kernels, and so is ``planes`` [modes, pixels] in single
+    precision, with room for the rows and six more.
     """
     width = first.shape[1]
-    near = second.shape[1]
+    modes, side = near.shape[1], near.shape[2]
     flat = first.reshape(-1)
-    flat_near = second.reshape(-1)
+    flat_near = near.reshape(-1)
     corner = charges.pad * charges.stride + charges.pad
     stride = np.uint64(charges.stride)
     constant = sums[8]
     half = width // 2
+    # Rows of the near modes from two below the first on, and the sixteen pixels beyond the last.
+    base = bottom + charges.pad - 2
+    if modes > 0:
+        _take_rows(
+            charges, base, min(top + charges.pad + 3, charges.ny + 2 * charges.pad), planes
+        )
     for group in range(first.shape[0]):
         begin = group * width * width * 8
-        begin_near = group * near * near * 8
+        begin_near = group * modes * side * side * 8
         for k in range(8):
             constant[k] = 0
         for n in range(width * width):
             for k in range(8):
-                constant[k] -= flat[begin + 8 * n + k] * low
-        for n in range(near * near):
+                constant[k] -= flat[begin + 8 * n + k] * lows[0]
+        for n in range(modes * side * side):
             for k in range(8):
-                constant[k] -= flat_near[begin_near + 8 * n + k] * low_second
+                constant[k] -= (
+                    flat_near[begin_near + 8 * n + k] * lows[1 + n // (side * side)]
+                )
         for j in range(bottom, top):
             for i in range(left, right, 16):
                 for k in range(8):
@@ -242,11 +288,11 @@ def convolved_areas(
                     np.uint64(corner + (j - half) * charges.stride + i - half), stride,
                     np.uint64(width), np.uint64(width), sums,
                 )  # fmt: skip
-                if near > 0:
+                for m in range(modes):
                     add_8_kernels(
-                        flat_near, np.uint64(begin_near), charges.second,
-                        np.uint64(corner + (j - 2) * charges.stride + i - 2), stride,
-                        np.uint64(near), np.uint64(near), sums,
+                        flat_near, np.uint64(begin_near + 8 * side * side * m), planes[m],
+                        np.uint64(corner + (j - 2 - base) * charges.stride + i - 2), stride,
+                        np.uint64(side), np.uint64(side), sums,
                     )  # fmt: skip
                 # Eight squares whatever the number of kernels: the others' factors are 0.
                 for m in range(np.uint64(min(right - i, 16))):

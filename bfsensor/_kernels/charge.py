@@ -11,6 +11,7 @@ import numpy as np
 
 from bfsensor._kernels.compile_options import ENTRY, INLINED, INNER
 from bfsensor._kernels.extremes import max, min
+from bfsensor._kernels.shifts import MODES, NEAR_MODES
 from bfsensor._kernels.surroundings import mirror_all, mirror_pixel, within
 
 TILE = 16
@@ -61,14 +62,15 @@ class Pixels(NamedTuple):
 
 
 class Response(NamedTuple):
-    """Effective charge of both modes by charge and background, on equal steps [e-].
+    """Effective charge by charge and background, on equal steps [e-]: first mode, and the others.
 
-    Arrays of size 0 stand for a linear sensor, whose effective charge is the charge.
+    The last index of ``near`` is the mode.  Arrays of size 0 stand for a linear sensor, whose
+    effective charge is the charge.
     ``last_charge`` and ``last_background`` are the ends of the grid, in steps.
     """
 
     first: np.ndarray
-    second: np.ndarray
+    near: np.ndarray
     charge_step: float
     background_step: float
     last_charge: float
@@ -84,12 +86,13 @@ class Ledger(NamedTuple):
     list has no room, or room for gains row by row, from ``starts`` [rows + 1] on; ``listed_before``
     are the pixels of the last block.  ``rows`` [3, columns + 2] is room for rows of charge, ``queue``
     and ``ahead`` [2, QUEUE] for pixels to be updated, what is to be added to their charge and their
-    background, and then both effective charges.  ``high_*`` are the largest
-    effective charges by tile, ``changes`` the number of changes since they were found, ``flags``
-    and ``flagged`` the tiles whose bounds are out of date.  ``spill_from`` and ``spill_to`` [side,
-    column] is where a column was full when it last spilled.  ``strikes`` [rows, columns] counts
-    the electrons that met a full pixel in the block, ``struck`` lists these pixels.  ``outside`` holds
-    both effective charges and the charge of the pixels beyond the image, unless they are ``mirrored``.
+    background, and ``found`` [QUEUE, NEAR_MODES], flat, for effective charges.  ``highs`` are the
+    largest effective charges by tile and mode, ``changes`` the number of changes since they were
+    found, ``flags`` and ``flagged`` the tiles whose bounds are out of date.  ``spill_from`` and
+    ``spill_to`` [side, column] is where a column was full when it last spilled.  ``strikes`` [rows,
+    columns] counts the electrons that met a full pixel in the block, ``struck`` lists these pixels.
+    ``outside`` holds the effective charges and then the charge of pixels beyond the image, unless they
+    are ``mirrored``.
     """
 
     carry: np.ndarray
@@ -101,9 +104,9 @@ class Ledger(NamedTuple):
     starts: np.ndarray
     queue: np.ndarray
     ahead: np.ndarray
+    found: np.ndarray
     listed_before: np.ndarray
-    high_first: np.ndarray
-    high_second: np.ndarray
+    highs: np.ndarray
     changes: np.ndarray
     flags: np.ndarray
     flagged: np.ndarray
@@ -130,12 +133,12 @@ def _shape(image):
 
 
 @numba.njit(**INNER)
-def _effective(response, charges, backgrounds, count):
-    """Replace charges and backgrounds of ``count`` pixels by both effective charges.
+def _effective(response, charges, backgrounds, near, count):
+    """Replace charges of ``count`` pixels by the first effective charge, and find the others.
 
     Beyond the grid the last values are held.  Returns how many pixels hold more than the grid.
     """
-    f, s = response.first, response.second
+    f, s = response.first, response.near
     per_charge, per_background = response.charge_step, response.background_step
     last_q, last_b = response.last_charge, response.last_background
     largest = last_q * per_charge
@@ -155,9 +158,12 @@ def _effective(response, charges, backgrounds, count):
         charges[n] = (
             a * f[m, k] + c * f[m + up, k] + d * f[m, k + up] + e * f[m + up, k + up]
         )
-        backgrounds[n] = (
-            a * s[m, k] + c * s[m + up, k] + d * s[m, k + up] + e * s[m + up, k + up]
-        )
+        to = np.uint64(NEAR_MODES) * n
+        for w in range(np.uint64(NEAR_MODES)):
+            near[to + w] = (
+                a * s[m, k, w] + c * s[m + up, k, w]
+                + d * s[m, k + up, w] + e * s[m + up, k + up, w]
+            )  # fmt: skip
     return beyond
 
 
@@ -175,7 +181,7 @@ def _charge(image, ledger, j, i):
     ny, nx = _shape(image)
     if not (0 <= j < ny and 0 <= i < nx):
         if not ledger.mirrored:
-            return ledger.outside[2]
+            return ledger.outside[MODES]
         j, i = within(j, ny), within(i, nx)
     return np.float32(charge_of(image, np.uint64(j), np.uint64(i)))
 
@@ -205,15 +211,13 @@ def _sum_at_border(image, ledger, j, i):
 
 
 @numba.njit(**INLINED)
-def _counted(charges, ledger, tile):
-    """Lowest and highest effective charge of both modes by which edges of a tile are bounded."""
-    low, high = charges.low_first[tile], ledger.high_first[tile]
-    low_second, high_second = charges.low_second[tile], ledger.high_second[tile]
+def _counted(charges, ledger, tile, mode):
+    """Lowest and highest effective charge of a mode in a tile, as it counts where edges are bounded."""
+    at = np.uint64(MODES) * np.uint64(tile) + np.uint64(mode)
+    low, high = charges.lows[at], ledger.highs[at]
     if low >= -FAINT and high <= FAINT:
-        high = FAINT
-    if low_second >= -FAINT and high_second <= FAINT:
-        low_second, high_second = -FAINT, FAINT
-    return low, high, low_second, high_second
+        return (low if mode == 0 else -FAINT), FAINT
+    return low, high
 
 
 @numba.njit(**INLINED)
@@ -235,7 +239,7 @@ def set_pixels(image, charges, ledger, response, count):
 
     One step after the other for all of them, so that many loads are under way at once.
     """
-    pixels, first, second = ledger.queue, ledger.ahead[0], ledger.ahead[1]
+    pixels, first, around = ledger.queue, ledger.ahead[0], ledger.ahead[1]
     width, pad, stride = np.uint64(charges.nx), np.uint64(charges.pad), charges.stride
     modes = response.first.size > 0
     for n in range(np.uint64(count)):
@@ -244,9 +248,9 @@ def set_pixels(image, charges, ledger, response, count):
         i = pixel - j * width
         first[n] += np.float32(charge_of(image, j, i))
         if modes:
-            second[n] = _around(image, ledger, np.int64(j), np.int64(i))
+            around[n] = _around(image, ledger, np.int64(j), np.int64(i))
     if modes:
-        ledger.counters[BEYOND] += _effective(response, first, second, count)
+        ledger.counters[BEYOND] += _effective(response, first, around, ledger.found, count)
     tiles_x = np.uint64((charges.nx + TILE - 1) // TILE)
     for n in range(np.uint64(count)):
         pixel = np.uint64(pixels[n])
@@ -255,29 +259,30 @@ def set_pixels(image, charges, ledger, response, count):
         at = (j + pad) * np.uint64(stride) + i + pad
         value = first[n]
         charges.first[at] = value
-        more = np.float32(0.0)
         if modes:
-            more = second[n]
-            charges.second[at] = more
+            for m in range(np.uint64(NEAR_MODES)):
+                charges.near[np.uint64(NEAR_MODES) * at + m] = ledger.found[
+                    np.uint64(NEAR_MODES) * n + m
+                ]
         if ledger.mirrored:
-            mirror_pixel(charges, charges.first, np.int64(j), np.int64(i))
+            mirror_pixel(charges, charges.first, 1, np.int64(j), np.int64(i))
             if modes:
-                mirror_pixel(charges, charges.second, np.int64(j), np.int64(i))
+                mirror_pixel(charges, charges.near, NEAR_MODES, np.int64(j), np.int64(i))
         tile = (j >> np.uint64(4)) * tiles_x + (i >> np.uint64(4))
         ledger.changes[tile] += 1
         # Margins follow from the ranges, most of which a few electrons leave as they were.
-        wider = value < charges.low_first[tile] or value > ledger.high_first[tile]
-        wider = wider or more < charges.low_second[tile] or more > ledger.high_second[tile]
-        if wider or ledger.changes[tile] >= REFRESH:
-            counted = _counted(charges, ledger, tile)
-            charges.low_first[tile] = min(charges.low_first[tile], value)
-            ledger.high_first[tile] = max(ledger.high_first[tile], value)
-            charges.low_second[tile] = min(charges.low_second[tile], more)
-            ledger.high_second[tile] = max(ledger.high_second[tile], more)
-            if ledger.changes[tile] >= REFRESH or counted != _counted(
-                charges, ledger, tile
-            ):
-                _flag(ledger, np.int64(tile))
+        changed = ledger.changes[tile] >= REFRESH
+        for m in range(np.uint64(MODES if modes else 1)):
+            place = np.uint64(MODES) * tile + m
+            if m > 0:
+                value = charges.near[np.uint64(NEAR_MODES) * at + m - np.uint64(1)]
+            if value < charges.lows[place] or value > ledger.highs[place]:
+                counted = _counted(charges, ledger, tile, m)
+                charges.lows[place] = min(charges.lows[place], value)
+                ledger.highs[place] = max(ledger.highs[place], value)
+                changed = changed or counted != _counted(charges, ledger, tile, m)
+        if changed:
+            _flag(ledger, np.int64(tile))
 
 
 @numba.njit(**INNER)
@@ -290,27 +295,27 @@ def _find_range(charges, ledger, tile):
     border = row == 0 or column == 0 or row == tiles_y - 1 or column == tiles_x - 1
     # Mirrored charge is that of this tile and of its neighbours.
     border = border and not ledger.mirrored
-    low = ledger.outside[0] if border else np.float32(np.inf)
-    high = ledger.outside[0] if border else np.float32(-np.inf)
-    low_second = ledger.outside[1] if border else low
-    high_second = ledger.outside[1] if border else high
-    for j in range(row * TILE, min((row + 1) * TILE, charges.ny)):
-        start = (j + charges.pad) * charges.stride + charges.pad
-        for i in range(column * TILE, min((column + 1) * TILE, charges.nx)):
-            at = np.uint64(start + i)
-            low = min(low, charges.first[at])
-            high = max(high, charges.first[at])
-            if charges.second.size > 0:
-                low_second = min(low_second, charges.second[at])
-                high_second = max(high_second, charges.second[at])
-    charges.low_first[tile] = low
-    ledger.high_first[tile] = high
-    if charges.second.size > 0:
-        charges.low_second[tile] = low_second
-        ledger.high_second[tile] = high_second
-    else:
-        charges.low_second[tile] = np.float32(0.0)
-        ledger.high_second[tile] = np.float32(0.0)
+    for m in range(MODES):
+        place = np.uint64(MODES * tile + m)
+        if m > 0 and charges.near.size == 0:
+            charges.lows[place] = np.float32(0.0)
+            ledger.highs[place] = np.float32(0.0)
+            continue
+        low = ledger.outside[m] if border else np.float32(np.inf)
+        high = ledger.outside[m] if border else np.float32(-np.inf)
+        for j in range(row * TILE, min((row + 1) * TILE, charges.ny)):
+            start = (j + charges.pad) * charges.stride + charges.pad
+            for i in range(column * TILE, min((column + 1) * TILE, charges.nx)):
+                at = start + i
+                value = (
+                    charges.first[np.uint64(at)]
+                    if m == 0
+                    else charges.near[np.uint64(NEAR_MODES * at + m - 1)]
+                )
+                low = min(low, value)
+                high = max(high, value)
+        charges.lows[place] = low
+        ledger.highs[place] = high
     ledger.changes[tile] = 0
 
 
@@ -321,19 +326,18 @@ def _find_margin(charges, ledger, edges, tile):
     tiles_y = (charges.ny + TILE - 1) // TILE
     row = tile // tiles_x
     column = tile - row * tiles_x
-    low, high, low_second, high_second = _counted(charges, ledger, tile)
-    for j in range(max(row - 1, 0), min(row + 2, tiles_y)):
-        for i in range(max(column - 1, 0), min(column + 2, tiles_x)):
-            here = _counted(charges, ledger, j * tiles_x + i)
-            low = min(low, here[0])
-            high = max(high, here[1])
-            low_second = min(low_second, here[2])
-            high_second = max(high_second, here[3])
-    size = max(high - low, high_second - low_second)
+    size, most = np.float32(0.0), np.float32(0.0)
+    for m in range(edges.modes):
+        low, high = _counted(charges, ledger, tile, m)
+        for j in range(max(row - 1, 0), min(row + 2, tiles_y)):
+            for i in range(max(column - 1, 0), min(column + 2, tiles_x)):
+                here = _counted(charges, ledger, j * tiles_x + i, m)
+                low = min(low, here[0])
+                high = max(high, here[1])
+        size = max(size, high - low)
+        most = max(most, max(abs(low), abs(high)))
     # Single precision: rounding of the shift, and of what cancels in its sum.
-    margin = np.float32(edges.normal) * (
-        size + np.float32(1e-6) * max(abs(low), abs(high))
-    ) + np.float32(2e-6)
+    margin = np.float32(edges.normal) * (size + np.float32(1e-6) * most) + np.float32(2e-6)
     charges.margins[tile] = margin if margin < 0.5 else np.float32(1.0)
     level = 0
     if size > 250.0:
@@ -365,13 +369,13 @@ def find_margins(charges, ledger, edges):
 
 
 @numba.njit(**INNER)
-def _respond(response, above, here, below, begin, first, second, start, count):
+def _respond(response, above, here, below, begin, first, near, start, count):
     """Find the effective charge of ``count`` pixels of a row from the rows around them.
 
-    ``first`` holds what is to be added ahead; the pixels are at ``start`` there and in ``second``, and
+    ``first`` holds what is to be added ahead; the pixels are at ``start`` there and in ``near``, and
     at ``begin`` in the rows of charge.
     """
-    f, s = response.first, response.second
+    f, s = response.first, response.near
     last_q = np.float32(response.last_charge)
     last_b = np.float32(response.last_background)
     per_q = np.float32(1.0 / response.charge_step)
@@ -405,9 +409,12 @@ def _respond(response, above, here, below, begin, first, second, start, count):
         first[at] = (
             a * f[i, j] + c * f[i + up, j] + d * f[i, j + up] + e * f[i + up, j + up]
         )
-        second[at] = (
-            a * s[i, j] + c * s[i + up, j] + d * s[i, j + up] + e * s[i + up, j + up]
-        )
+        to = np.uint64(NEAR_MODES) * at
+        for w in range(np.uint64(NEAR_MODES)):
+            near[to + w] = (
+                a * s[i, j, w] + c * s[i + up, j, w]
+                + d * s[i, j + up, w] + e * s[i + up, j + up, w]
+            )  # fmt: skip
     return beyond
 
 
@@ -484,7 +491,7 @@ def _load_row(image, ledger, j, out):
     """Copy a row of the image in single precision, with a pixel of the surroundings on each side."""
     ny, nx = _shape(image)
     if not (0 <= j < ny or ledger.mirrored):
-        out[:] = ledger.outside[2]
+        out[:] = ledger.outside[MODES]
         return
     row = np.uint64(within(j, ny))
     for i in range(np.uint64(nx)):
@@ -509,7 +516,7 @@ def _respond_in_row(charges, ledger, response, j):
         if count > 0 and response.first.size > 0:
             ledger.counters[BEYOND] += _respond(
                 response, above, here, below, np.uint64(first + 1), charges.first,
-                charges.second, np.uint64(start + first), count,
+                charges.near, np.uint64(start + first), count,
             )  # fmt: skip
         for i in range(0 if response.first.size > 0 else count):
             charges.first[np.uint64(start + first + i)] += here[np.uint64(first + 1 + i)]
@@ -534,20 +541,20 @@ def _respond_flagged(image, charges, ledger, response):
 @numba.njit(**INNER)
 def take_image(image, charges, ledger, response, edges, ahead):
     """Update the frozen charge from the whole image; ``ahead`` times each pixel's gain is added."""
-    # Without a second mode and without prediction the charge itself is the effective one.
+    # Without other modes and without prediction the charge itself is the effective one.
     apart = response.first.size > 0 or ledger.listed_before.size > 0
     # At first all is zero, and where the image is it may stay so.
     fresh = ledger.counters[TAKEN] == 0
     ledger.counters[TAKEN] = 1
-    if fresh and ledger.outside[2] != np.float32(0.0):
+    if fresh and ledger.outside[MODES] != np.float32(0.0):
         _flag_sides(charges, ledger)
     _flag_charge(image, charges, ledger, ahead, apart, fresh)
     if apart:
         _respond_flagged(image, charges, ledger, response)
     if ledger.mirrored:
-        mirror_all(charges, charges.first)
+        mirror_all(charges, charges.first, 1)
         if response.first.size > 0:
-            mirror_all(charges, charges.second)
+            mirror_all(charges, charges.near, NEAR_MODES)
     ledger.counters[FLAGGED] = 0
     for tile in range(ledger.flags.size):
         if ledger.flags[tile]:

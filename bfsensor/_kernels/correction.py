@@ -7,15 +7,17 @@ corner in which both begin.
 import numba
 import numpy as np
 
+from bfsensor._kernels.shifts import NEAR_MODES
+
 OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
 """Bands of an image are corrected by threads side by side, which needs kernels that let others run."""
 
 
 @numba.njit(**OPTIONS)
 def mean_charges(
-    light, image, first, second, charge_step, background_step, times, weights, out
+    light, image, first, near, charge_step, background_step, times, weights, out
 ):
-    """Average the effective charges of both modes over an exposure, into ``out`` (2, y, x).
+    """Average the effective charges of all modes over an exposure, into ``out`` (modes, y, x).
 
     At a part t of the exposure a pixel holds ``t light + t^2 (image - light)``, as the effect grows with
     the square of the time; its background is the mean of the eight around it, those beyond the field
@@ -49,7 +51,8 @@ def mean_charges(
                 0.125 * (images[x] + images[x + 1] + images[x + 2] - image[y, x]) - around
             )
             one = 0.0
-            two = 0.0
+            for m in range(NEAR_MODES):
+                out[1 + m, y, x] = 0.0
             for n in range(times.size):
                 t = times[n]
                 q = t * (own + t * gained)
@@ -69,10 +72,11 @@ def mean_charges(
                 w11 = weights[n] * u * v
                 one += w00 * first[i, j] + w01 * first[i, j + 1]
                 one += w10 * first[i + 1, j] + w11 * first[i + 1, j + 1]
-                two += w00 * second[i, j] + w01 * second[i, j + 1]
-                two += w10 * second[i + 1, j] + w11 * second[i + 1, j + 1]
+                for m in range(NEAR_MODES):
+                    more = w00 * near[i, j, m] + w01 * near[i, j + 1, m]
+                    more += w10 * near[i + 1, j, m] + w11 * near[i + 1, j + 1, m]
+                    out[1 + m, y, x] += more
             out[0, y, x] = one
-            out[1, y, x] = two
 
 
 @numba.njit(**OPTIONS)

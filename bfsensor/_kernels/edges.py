@@ -31,8 +31,8 @@ from bfsensor._kernels.shifts import (
 
 
 @numba.njit(**INNER)
-def _crossing(weights, sums, points, nearest, first, second, g, upright, layer, part, line,
-              along, limit, scale, low_first, low_second):  # fmt: skip
+def _crossing(weights, sums, points, nearest, first, near_charges, g, upright, layer, part, line,
+              along, limit, scale, lows, tile):  # fmt: skip
     """Normal shift [pixel] of the polyline ``line`` where it passes ``along`` [pixel].
 
     The edges of a line follow one another; the search starts where the tangential shift of
@@ -44,22 +44,21 @@ def _crossing(weights, sums, points, nearest, first, second, g, upright, layer, 
     other = min(max(np.int64(np.floor(along)), -1), limit)
     point = nearest[np.uint64(min(max(np.int64((along - other) * bins), 0), bins - 1))]
     moved = along - scale * shift_of(
-        weights, sums, first, second, g, upright,
-        layer + np.int64(part > np.float32(0.5)), point, TANGENTIAL, line, other, low_first,
-        low_second,
+        weights, sums, first, near_charges, g, upright,
+        layer + np.int64(part > np.float32(0.5)), point, TANGENTIAL, line, other, lows, tile,
     )  # fmt: skip
     other = min(max(np.int64(np.floor(moved)), -1), limit)
     low = nearest[np.uint64(min(max(np.int64((moved - other) * bins), 0), bins - 1))]
     low -= np.int64(low > 0 and points[low] > moved - other)
     low = min(low, last - 1)
     lower, shift = point_shift(
-        weights, sums, first, second, g, upright, layer, part, low, line, other, scale,
-        low_first, low_second,
+        weights, sums, first, near_charges, g, upright, layer, part, low, line, other, scale,
+        lows, tile,
     )  # fmt: skip
     below = other + points[low] + shift
     upper, shift = point_shift(
-        weights, sums, first, second, g, upright, layer, part, low + 1, line, other, scale,
-        low_first, low_second,
+        weights, sums, first, near_charges, g, upright, layer, part, low + 1, line, other, scale,
+        lows, tile,
     )  # fmt: skip
     above = other + points[low + 1] + shift
     high = low + 1
@@ -76,8 +75,8 @@ def _crossing(weights, sums, points, nearest, first, second, g, upright, layer, 
                 return lower
             low = last
         lower, shift = point_shift(
-            weights, sums, first, second, g, upright, layer, part, low, line, down, scale,
-            low_first, low_second,
+            weights, sums, first, near_charges, g, upright, layer, part, low, line, down, scale,
+            lows, tile,
         )  # fmt: skip
         below = down + points[low] + shift
     up = other
@@ -92,8 +91,8 @@ def _crossing(weights, sums, points, nearest, first, second, g, upright, layer, 
                 return upper
             high = 0
         upper, shift = point_shift(
-            weights, sums, first, second, g, upright, layer, part, high, line, up, scale,
-            low_first, low_second,
+            weights, sums, first, near_charges, g, upright, layer, part, high, line, up, scale,
+            lows, tile,
         )  # fmt: skip
         above = up + points[high] + shift
     if not below < above:
@@ -214,7 +213,7 @@ def _decide(edges, charges, hot, upright, across, along, z, near, count, out):
     nx, ny = charges.nx, charges.ny
     g = grid(edges, charges)
     weights, sums, points, nearest = edges.weights, edges.sums, edges.points, edges.nearest
-    doubts, first, second = edges.doubts, charges.first, charges.second
+    doubts, first, near_charges = edges.doubts, charges.first, charges.near
     scales, per_um = edges.scale, np.float32(edges.per_um)
     bins = nearest.size
     side = 0 if upright else 1
@@ -237,9 +236,9 @@ def _decide(edges, charges, hot, upright, across, along, z, near, count, out):
         level = np.uint64(min(charges.ranges[tile], doubts.shape[1] - 1))
         inside = 0 <= line <= lines
         shift = shift_of(
-            weights, sums, first, second, g, upright,
+            weights, sums, first, near_charges, g, upright,
             layer + np.int64(part > np.float32(0.5)), nearest[bin_], NORMAL,
-            line if inside else 0, other, charges.low_first[tile], charges.low_second[tile],
+            line if inside else 0, other, charges.lows, tile,
         )  # fmt: skip
         shift *= scale_at(scales, per_um, z[n])
         out[n] = line - np.int64(beyond <= shift)
@@ -261,8 +260,7 @@ def _decide(edges, charges, hot, upright, across, along, z, near, count, out):
             layer += np.int64(part > np.float32(0.5))
             part = np.float32(0.0)
         shift = _crossing(
-            weights, sums, points, nearest, first, second, g, upright, layer, part, line,
-            along[n], limit, scale_at(scales, per_um, z[n]), charges.low_first[tile],
-            charges.low_second[tile],
+            weights, sums, points, nearest, first, near_charges, g, upright, layer, part, line,
+            along[n], limit, scale_at(scales, per_um, z[n]), charges.lows, tile,
         )  # fmt: skip
         out[n] = line - np.int64(beyond <= shift)

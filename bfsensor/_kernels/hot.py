@@ -12,6 +12,7 @@ import numpy as np
 
 from bfsensor._kernels.compile_options import INLINED, INNER
 from bfsensor._kernels.extremes import max, min
+from bfsensor._kernels.shifts import MODES, NEAR_MODES
 from bfsensor._kernels.window import add_16_points
 
 FENCES = 16
@@ -111,7 +112,7 @@ def evaluate(edges, charges, hot, part, parts):
     blocks = (edges.points.size + 15) // 16
     pairs = q + 1
     far = (2 * q + 2) * 2 * pairs
-    size = 32 * (2 + far + (16 if edges.modes == 2 else 0))
+    size = 32 * (MODES + far + (16 * NEAR_MODES if edges.modes > 1 else 0))
     # One block of points after the other, so that their weights stay in the first-level cache.
     count = hot.used[1]
     for n in range(2 * blocks * count):
@@ -124,26 +125,28 @@ def evaluate(edges, charges, hot, part, parts):
         other = np.int64(hot.edge[place, 2])
         column, row = (line - q - 1, other - q) if side == 0 else (other - q, line - q - 1)
         at = (row + charges.pad) * charges.stride + column + charges.pad
-        at_near = at + (q - 1) * (charges.stride + 1)
-        tile = _tile(side, line, other, (charges.nx - 1) >> 4)
-        low = charges.low_first[tile]
-        low_second = charges.low_second[tile]
+        at_near = NEAR_MODES * (at + (q - 1) * (charges.stride + 1))
+        low = np.uint64(MODES) * _tile(side, line, other, (charges.nx - 1) >> 4)
         shifts = hot.lines[place]
         begin = np.uint64(block * size)
         to = np.uint64(32 * (block % blocks))
         for k in range(np.uint64(32)):
-            shifts[to + k] = (
-                -edges.by_point[begin + k] * low
-                - edges.by_point[begin + np.uint64(32) + k] * low_second
-            )
+            shifts[to + k] = -edges.by_point[begin + k] * charges.lows[low]
+        for m in range(np.uint64(1), np.uint64(edges.modes)):
+            for k in range(np.uint64(32)):
+                shifts[to + k] -= (
+                    edges.by_point[begin + np.uint64(32) * m + k] * charges.lows[low + m]
+                )
+        begin += np.uint64(32 * MODES)
         add_16_points(
-            edges.by_point, begin + np.uint64(64), charges.first, np.uint64(at), stride,
+            edges.by_point, begin, charges.first, np.uint64(at), stride,
             np.uint64(2 * q + 1 + side), np.uint64(pairs), shifts, to,
         )  # fmt: skip
-        if edges.modes == 2:
+        if edges.modes > 1:
             add_16_points(
-                edges.by_point, begin + np.uint64(64 + 32 * far), charges.second,
-                np.uint64(at_near), stride, np.uint64(3 + side), np.uint64(2), shifts, to,
+                edges.by_point, begin + np.uint64(32 * far), charges.near, np.uint64(at_near),
+                np.uint64(NEAR_MODES) * stride, np.uint64(3 + side), np.uint64(2 * NEAR_MODES),
+                shifts, to,
             )  # fmt: skip
 
 
@@ -184,7 +187,9 @@ def fence(edges, charges, hot, part, parts):
             continue
         back = np.float64(2.0 / FENCES + margin * edges.along)
         # Rounding of the shifts, here and where they are summed for one electron.
-        low = abs(charges.low_first[tile]) + abs(charges.low_second[tile])
+        low = np.float32(0.0)
+        for m in range(np.uint64(MODES)):
+            low += abs(charges.lows[np.uint64(MODES) * np.uint64(tile) + m])
         slack = np.float32(2e-6) + np.float32(1e-5) * (
             margin + np.float32(edges.normal) * low
         )

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor._kernels.areas import convolved_areas
-from bfsensor._kernels.shifts import Charges, Edges
+from bfsensor._kernels.areas import charge_ranges, convolved_areas
+from bfsensor._kernels.shifts import MODES, NEAR_MODES, Charges, Edges
 from bfsensor.typing import FloatArray
 
 _LARGE = 512 * 512
@@ -40,11 +40,11 @@ class AreaKernels:
     Attributes
     ----------
     linear : pair of ndarray, shape (rows, columns)
-        Linear kernels a of both modes [1/e-]; the second is empty where there is one mode.
+        Linear kernels a [1/e-] of the first mode, and (modes, 5, 5) of the others, if there are any.
     values : ndarray, shape (kernels,)
         Eigenvalues lambda, sorted by falling size [1/e-^2].
-    squares : pair of ndarray, shape (kernels, rows, columns)
-        Kernels w of both modes, unit vectors.
+    squares : pair of ndarray, shapes (kernels, rows, columns) and (kernels, modes, 5, 5)
+        Kernels w of the first mode and of the others, unit vectors.
     """
 
     linear: tuple[FloatArray, FloatArray]
@@ -65,7 +65,7 @@ def area_kernels(edges: Edges) -> AreaKernels:
     AreaKernels
     """
     q, points = edges.reach, len(edges.points)
-    widths = [2 * q + 3] + ([5] if edges.modes == 2 else [])
+    widths = [2 * q + 3] + [5] * (edges.modes - 1)
     sizes = [w * w for w in widths]
     moves = np.zeros((2, 4 * points, sum(sizes)))
     nominal = np.zeros((2, 4 * points))
@@ -103,24 +103,22 @@ def area_kernels(edges: Edges) -> AreaKernels:
     vectors = vectors[:, order].T
 
     def shape(a: FloatArray) -> tuple[FloatArray, FloatArray]:
-        parts = [a[..., : sizes[0]].reshape(*a.shape[:-1], widths[0], widths[0])]
-        if edges.modes == 2:
-            parts.append(a[..., sizes[0] :].reshape(*a.shape[:-1], 5, 5))
-        else:
-            parts.append(np.zeros((*a.shape[:-1], 0, 0)))
-        return parts[0], parts[1]
+        first = a[..., : sizes[0]].reshape(*a.shape[:-1], widths[0], widths[0])
+        return first, a[..., sizes[0] :].reshape(*a.shape[:-1], edges.modes - 1, 5, 5)
 
     return AreaKernels(shape(linear), values[order], shape(vectors))
 
 
 def _block(edges: Edges, side: int, mode: int) -> FloatArray:
     """Weights of the topmost layer, (component, point, row, column), without the padding."""
-    reach, lanes = (edges.reach, edges.lanes) if mode == 0 else (1, 8)
+    reach, lanes = (edges.reach, edges.lanes) if mode == 0 else (1, 16)
     rows, columns = 2 * reach + 1 + side, 2 * reach + 2 - side
     size = 2 * len(edges.points) * rows * lanes
-    start = int(edges.starts[2 * mode + side]) + (edges.layers - 1) * size
-    block = edges.weights[start : start + size]
-    return block.reshape(2, len(edges.points), rows, lanes)[..., :columns].astype(float)
+    start = int(edges.starts[2 * (mode > 0) + side]) + (edges.layers - 1) * size
+    block = edges.weights[start : start + size].reshape(2, len(edges.points), rows, lanes)
+    # The modes of the nearest pixels lie side by side.
+    places = np.arange(columns) if mode == 0 else mode - 1 + NEAR_MODES * np.arange(columns)
+    return block[..., places].astype(float)
 
 
 class Convolution:
@@ -138,12 +136,11 @@ class Convolution:
 
     def __init__(self, kernels: AreaKernels, charges: Charges, outside: float) -> None:
         self._charges = charges
-        first, second = (_inside(charges, a) for a in (charges.first, charges.second))
-        self._lows = low, low_second = _lowest(charges)
-        inner = max(
-            float(first.max() - low),
-            float(second.max(initial=low_second) - low_second),
-        )
+        self._lows, highs = np.empty((2, MODES), np.float32)
+        charge_ranges(charges, self._lows, highs)
+        low = self._lows[0]
+        inner = float((highs - self._lows).max())
+        self._planes = np.zeros((NEAR_MODES, 0), np.float32)
         ny, nx = charges.ny, charges.nx
         # Single precision is good to 1e-7 and twice as fast; small images, where the time hardly
         # matters, are summed in double precision as GalSim's are.
@@ -168,48 +165,36 @@ class Convolution:
 
     def write(self, first_row: int, out: FloatArray) -> None:
         """Write the areas [nominal area] of some rows to ``out``, shape (rows, nx)."""
-        for (first, second, values), (bottom, top, left, right) in self._parts:
+        for (first, near, values), (bottom, top, left, right) in self._parts:
             begin, end = max(bottom, first_row), min(top, first_row + len(out))
             if begin < end:
+                size = (end - begin + 6) * self._charges.stride
+                if near.shape[1] and self._planes.shape[1] < size:
+                    self._planes = np.zeros((NEAR_MODES, size), np.float32)
                 convolved_areas(
-                    self._charges, first, second, values, *self._lows, begin, end, left, right,
-                    self._sums, first_row, out,
+                    self._charges, self._planes, first, near, values, self._lows, begin, end,
+                    left, right, self._sums, first_row, out,
                 )  # fmt: skip
-
-
-def _inside(charges: Charges, array: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Cut the pixels of the image out of a padded array."""
-    if not array.size:
-        return array
-    pad, rows = charges.pad, charges.ny + 2 * charges.pad
-    grid = array[: rows * charges.stride].reshape(rows, charges.stride)
-    return grid[pad : pad + charges.ny, pad : pad + charges.nx]
-
-
-def _lowest(charges: Charges) -> tuple[np.float32, np.float32]:
-    """Lowest effective charge of both modes in the image."""
-    first, second = (_inside(charges, a) for a in (charges.first, charges.second))
-    return first.min(), second.min() if second.size else np.float32(0)
 
 
 def _chosen(
     kernels: AreaKernels, spread: float, kind: type[np.floating]
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], FloatArray]:
-    """Kernels of both modes that matter for a spread of charge, and their factors, by eight."""
+    """Kernels of all modes that matter for a spread of charge, and their factors, by eight."""
     count = int(np.sum(np.abs(kernels.values) * (0.5 * spread) ** 2 > _SMALL_AREA))
-    first, second = (
+    first, near = (
         _by_eight([linear[None], squares[:count]]).astype(kind)
         for linear, squares in zip(kernels.linear, kernels.squares, strict=True)
     )
     values = _by_eight([np.zeros((1, 1, 1)), kernels.values[:count, None, None]])
-    return first, second, values[:, 0, 0]
+    return first, near, values[:, 0, 0]
 
 
 def _by_eight(kernels: list[FloatArray]) -> FloatArray:
-    """Order kernels [kernel, row, column] as [eight kernels, row, column, kernel], filled up with 0."""
+    """Order kernels [kernel, ..., row, column] as [eight kernels, ..., row, column, kernel], with 0."""
     flat = np.concatenate(kernels)
     groups = -(-len(flat) // 8)
     full = np.zeros((8 * groups, *flat.shape[1:]))
     full[: len(flat)] = flat
     shaped = full.reshape(groups, 8, *flat.shape[1:])
-    return np.ascontiguousarray(shaped.transpose(0, 2, 3, 1))
+    return np.ascontiguousarray(np.moveaxis(shaped, 1, -1))

@@ -68,7 +68,7 @@ def make_shifts(
             kept[whole] = factors
     change = EdgeChange()
     if applied is not None:
-        change = applied.change_of_edges(factors.first, factors.points)
+        change = applied.change_of_edges(factors.modes[0], factors.points)
     key = (*whole, strength, transpose, reach)
     if change.is_none() and (found := packed.pop(key, None)) is not None:
         packed[key] = found  # last in the order, as the one used last
@@ -76,19 +76,14 @@ def make_shifts(
     if reach == table.reach:
         reach = max(reach, min(change.reach, REACH))
     modes = []
-    for number, sides in enumerate((factors.first, factors.second)):
-        if sides is None:
-            continue
+    for number, sides in enumerate(factors.modes):
         if not change.is_none():
             # Effects add shifts in proportion to the charge, which the first mode carries.
             own = change._replace(added=None) if number else change
             sides = change_sides(sides, factors.points, own, reach)
         turned = transpose_sides(*sides) if transpose else sides
         modes.append((strength * turned[0], strength * turned[1]))
-    edges = make_edges(
-        modes[0], modes[1] if len(modes) > 1 else None, factors.points, factors.heights,
-        reach,
-    )  # fmt: skip
+    edges = make_edges(modes, factors.points, factors.heights, reach)
     # Growth with charge changes the effective charges only, not the edges.
     if change.is_none():
         packed[key] = edges

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
-from bfsensor._kernels.shifts import Edges
+from bfsensor._kernels.shifts import NEAR_MODES, Edges
 from bfsensor.typing import FloatArray
 
 _BINS = 128
@@ -15,10 +17,10 @@ Chosen: the bounds decide only which electrons are held against the whole bounda
 many bins they are tighter and the tables twice as large."""
 
 _NEAR = 1
-"""Largest distance [pixel] of a source to which the second mode applies.
+"""Largest distance [pixel] of a source to which the modes of the nearest pixels apply.
 
-Chosen: farther away the response is proportional to the first mode; at 2 the window of the second
-mode would hold 25 pixels in place of 9."""
+Chosen: farther away the response is proportional to the first mode; at 2 their windows would hold 25
+pixels in place of 9."""
 
 _CHANGE_BINS = 512
 """Bins of height in which the change of shifts from the topmost layer is bounded.
@@ -105,21 +107,20 @@ def window_weights(
 
 
 def make_edges(
-    first: tuple[FloatArray, FloatArray],
-    second: tuple[FloatArray, FloatArray] | None,
+    modes: Sequence[tuple[FloatArray, FloatArray]],
     points: FloatArray,
     heights: FloatArray,
     reach: int,
     *,
     scale: FloatArray | None = None,
 ) -> Edges:
-    """Pack the shifts of both modes for the kernels, with bounds on them.
+    """Pack the shifts of all modes for the kernels, with bounds on them.
 
     Parameters
     ----------
-    first, second : pair of ndarray
-        Vertical and horizontal sides of each mode as for :func:`window_weights`; the second
-        mode applies to sources within one pixel only, and may be None.
+    modes : sequence of pairs of ndarray
+        Vertical and horizontal sides of each mode as for :func:`window_weights`: one mode, or with it
+        all of those that apply to sources within one pixel only.
     points : ndarray
         Nominal positions along a side, from 0 to 1.
     heights : ndarray, shape (layers,)
@@ -134,25 +135,24 @@ def make_edges(
     Edges
     """
     lanes = 8 if 2 * reach + 2 <= 8 else 16
-    modes = [window_weights(*first, reach)]
-    if second is not None:
-        modes.append(window_weights(*second, _NEAR))
-    near = len(modes) == 2
-    sums = np.zeros((2, *modes[0][0].shape[:3], 2))
+    windows = [window_weights(*modes[0], reach)]
+    windows += [window_weights(*mode, _NEAR) for mode in modes[1:]]
+    sums = np.zeros((2, *windows[0][0].shape[:3], 1 + NEAR_MODES))
     blocks = []
     for side in (0, 1):
-        for m, mode in enumerate(modes):
+        for m, mode in enumerate(windows):
             sums[side, ..., m] = mode[side].sum((-2, -1))
-        blocks.append(_pack(modes[0][side], lanes))
+        blocks.append(_pack(windows[0][side], lanes))
     for side in (0, 1):
-        blocks.append(_pack(modes[1][side], 8) if near else np.zeros(0, np.float32))
+        near = [mode[side] for mode in windows[1:]]
+        blocks.append(_pack(_side_by_side(near), 16) if near else np.zeros(0, np.float32))
     centres = (np.arange(_BINS) + 0.5) / _BINS
     nearest = np.abs(centres[:, None] - points).argmin(1)
-    normal, doubts = _bounds(modes, points, nearest)
+    normal, doubts = _bounds(windows, points, nearest)
     log_step = float(np.log(heights[1] / heights[0])) if len(heights) > 1 else 1.0
     factor = np.ones(2) if scale is None else np.asarray(scale, float)
     change, along = _changes(
-        modes, float(heights[-1]), log_step, float(normal.max()), factor
+        windows, float(heights[-1]), log_step, float(normal.max()), factor
     )
     used = np.flatnonzero(change[:, 0] <= _DEEPEST)
     per_change = _CHANGE_BINS / float(heights[-1])
@@ -165,11 +165,11 @@ def make_edges(
         points=np.ascontiguousarray(points, float),
         nearest=nearest.astype(np.int64),
         doubts=doubts,
-        alike=_alike(modes),
+        alike=_alike(windows),
         shares=(normal / normal.max() if normal.max() > 0 else np.ones(2)).astype(
             np.float32
         ),
-        by_point=_by_point(modes, float(factor[-1])),
+        by_point=_by_point(windows, float(factor[-1])),
         change=change,
         per_change=per_change,
         along=along,
@@ -178,10 +178,16 @@ def make_edges(
         reach=int(reach),
         lanes=lanes,
         layers=len(heights),
-        modes=len(modes),
+        modes=len(windows),
         log_z0=float(np.log(heights[0])),
         log_step=log_step,
     )
+
+
+def _side_by_side(modes: list[FloatArray]) -> FloatArray:
+    """Join the modes of a window in its columns, those of a pixel side by side."""
+    joined = np.stack(modes, -1)
+    return joined.reshape(*joined.shape[:-2], -1)
 
 
 def _pack(weights: FloatArray, lanes: int) -> NDArray[np.float32]:
@@ -200,17 +206,18 @@ def _by_point(
     sides = []
     for side in (0, 1):
         weights = [factor * mode[side][-1] for mode in modes]
-        sums = [w.sum((-2, -1))[..., None] for w in weights]
-        if len(sums) == 1:
-            sums.append(np.zeros_like(sums[0]))
-        flat = []
-        for w in weights:
+        sums = np.zeros((points, 2, 1 + NEAR_MODES))
+        squares = []
+        for m, w in enumerate(weights):
+            sums[..., m] = w.sum((-2, -1))
             size = max(w.shape[-2:])
             square = np.zeros((points, 2, size, size))
             square[..., : w.shape[-2], : w.shape[-1]] = w
-            flat.append(square.reshape(points, 2, -1))
-        packed = np.zeros((16 * blocks, 2, 2 + sum(f.shape[-1] for f in flat)))
-        packed[:points] = np.concatenate([*sums, *flat], -1)
+            squares.append(square)
+        flat = [squares[0], _side_by_side(squares[1:])] if squares[1:] else squares
+        parts = [sums, *(f.reshape(points, 2, -1) for f in flat)]
+        packed = np.zeros((16 * blocks, 2, sum(part.shape[-1] for part in parts)))
+        packed[:points] = np.concatenate(parts, -1)
         sides.append(packed.reshape(blocks, 16, 2, -1).transpose(0, 3, 2, 1))
     return np.stack(sides).astype(np.float32).ravel()
 

@@ -18,7 +18,7 @@ from bfsensor._kernels import shoot as _shoot
 from bfsensor._kernels.charge import TILE, Ledger, Pixels, Response
 from bfsensor._kernels.hot import FENCES, Hot
 from bfsensor._kernels.photons import Light, Medium, Pattern
-from bfsensor._kernels.shifts import Charges, Edges
+from bfsensor._kernels.shifts import MODES, NEAR_MODES, Charges, Edges
 from bfsensor.typing import FloatArray
 
 _HOT_PAGES, _HOT_EDGES = 256, 4096
@@ -300,20 +300,21 @@ def _clear(charges: Charges, ledger: Ledger, hot: Hot) -> None:
     only images with mirrored sides change.
     """
     for zeros in (
-        charges.low_first, charges.low_second, charges.margins, charges.ranges, ledger.carry,
-        ledger.marks, ledger.high_first, ledger.high_second, ledger.changes, ledger.flags,
+        charges.lows, charges.margins, charges.ranges, ledger.carry, ledger.marks, ledger.highs,
+        ledger.changes, ledger.flags,
         ledger.strikes, ledger.counters, ledger.sums, hot.used,
     ):  # fmt: skip
         zeros.fill(0)
     for none in (ledger.spill_from, ledger.spill_to, hot.page_of):
         none.fill(-1)
     ny, nx, pad = charges.ny, charges.nx, charges.pad
-    for effective in (charges.first, charges.second):
+    for effective, each in ((charges.first, 1), (charges.near, NEAR_MODES)):
         if ledger.mirrored:
             effective.fill(0)
         elif effective.size:
-            rows = effective[: (ny + 2 * pad) * charges.stride].reshape(-1, charges.stride)
-            rows[pad : pad + ny, pad : pad + nx] = 0
+            stride = each * charges.stride
+            rows = effective[: (ny + 2 * pad) * stride].reshape(-1, stride)
+            rows[pad : pad + ny, each * pad : each * (pad + nx)] = 0
 
 
 def _copied(part: Any) -> Any:
@@ -321,27 +322,28 @@ def _copied(part: Any) -> Any:
     return part.copy() if isinstance(part, np.ndarray) else part
 
 
-def _outside(physics: Physics) -> tuple[float, float, float]:
+def _outside(physics: Physics) -> tuple[float, ...]:
     """Effective charges, and charge, of a pixel whose neighbours hold that of the surroundings."""
     level = physics.surroundings
     if level == 0.0 or np.isnan(level):
-        return 0.0, 0.0, 0.0
+        return (0.0,) * (MODES + 1)
     # One pixel among its own mirror images.
     alone = replace(physics, surroundings=np.nan)
     image = np.array([[level]])
     charges, ledger = _allocate(image, alone)
     _charge.hold_image(as_pixels(image), charges, ledger, physics.response, physics.edges)
-    second = charges.second[0] if charges.second.size else 0.0
-    return float(charges.first[0]), float(second), level
+    near = charges.near[:NEAR_MODES] if charges.near.size else np.zeros(NEAR_MODES)
+    return float(charges.first[0]), *map(float, near), level
 
 
-def _surround(array: NDArray[np.float32], value: float, shape: tuple[int, int], pad: int,
-              stride: int) -> None:  # fmt: skip
-    """Fill the padding of an array with a value; that of zeros stays as it is."""
-    if not value or not array.size:
+def _surround(array: NDArray[np.float32], value: NDArray[np.float32], shape: tuple[int, int],
+              pad: int, stride: int) -> None:  # fmt: skip
+    """Fill the padding of an array with the values of a pixel; that of zeros stays as it is."""
+    if not value.any() or not array.size:
         return
     ny, nx = shape
-    rows = array[: (ny + 2 * pad) * stride].reshape(-1, stride)
+    size = (ny + 2 * pad) * stride * len(value)
+    rows = array[:size].reshape(-1, stride, len(value))
     rows[:pad] = rows[pad + ny :] = value
     rows[:, :pad] = rows[:, pad + nx :] = value
 
@@ -357,20 +359,17 @@ def _allocate(image: NDArray[np.floating], physics: Physics) -> tuple[Charges, L
     tiles = ((nx + TILE - 1) // TILE) * ((ny + TILE - 1) // TILE)
 
     # Small arrays are made together: for a stamp, making them one by one takes as long as its light.
-    low_first, low_second, margins, high_first, high_second = np.zeros(
-        (5, tiles), np.float32
-    )
+    lows, highs = np.zeros((2, MODES * tiles), np.float32)
     spill_from, spill_to = np.full((2, 2, max(nx, ny)), -1, np.int64)
     charges = Charges(
         first=np.zeros(size, np.float32),
-        second=np.zeros(size, np.float32) if modes else _EMPTY,
+        near=np.zeros(NEAR_MODES * size, np.float32) if modes else _EMPTY,
         stride=stride,
         pad=pad,
         nx=nx,
         ny=ny,
-        low_first=low_first,
-        low_second=low_second,
-        margins=margins,
+        lows=lows,
+        margins=np.zeros(tiles, np.float32),
         ranges=np.zeros(tiles, np.int64),
     )
     # Pixels that one block may list; if it touches more, all pixels of the image are updated.
@@ -386,9 +385,9 @@ def _allocate(image: NDArray[np.floating], physics: Physics) -> tuple[Charges, L
         starts=np.zeros(ny + 1, np.int32),
         queue=np.zeros(_charge.QUEUE, np.int32),
         ahead=np.zeros((2, _charge.QUEUE), np.float32),
+        found=np.zeros(NEAR_MODES * _charge.QUEUE, np.float32),
         listed_before=np.empty(longest if physics.predict else 0, np.int32),
-        high_first=high_first,
-        high_second=high_second,
+        highs=highs,
         changes=np.zeros(tiles, np.int32),
         flags=np.zeros(tiles, bool),
         flagged=np.zeros(tiles, np.int64),
@@ -403,8 +402,6 @@ def _allocate(image: NDArray[np.floating], physics: Physics) -> tuple[Charges, L
         mirrored=bool(np.isnan(physics.surroundings)),
     )
     if not ledger.mirrored:
-        for array, value in zip(
-            (charges.first, charges.second), ledger.outside, strict=False
-        ):
-            _surround(array, float(value), (ny, nx), pad, stride)
+        _surround(charges.first, ledger.outside[:1], (ny, nx), pad, stride)
+        _surround(charges.near, ledger.outside[1:MODES], (ny, nx), pad, stride)
     return charges, ledger

@@ -8,7 +8,7 @@ import numpy as np
 
 from bfsensor._kernels.areas import pixel_areas, times_ring_areas
 from bfsensor._kernels.photons import Pattern
-from bfsensor._kernels.shifts import Charges, Edges
+from bfsensor._kernels.shifts import MODES, Charges, Edges
 from bfsensor.typing import FloatArray
 
 _RING_AREA = 1e-6
@@ -66,10 +66,10 @@ def _polygons(pattern: Pattern, edges: Edges, shape: tuple[int, ...]) -> FloatAr
     out = np.empty(shape)
     none = np.zeros(0, np.float32)
     charges = Charges(
-        none, none, 1, 0, shape[1], shape[0], none, none, none, np.zeros(0, np.int64)
+        none, none, 1, 0, shape[1], shape[0], none, none, np.zeros(0, np.int64)
     )
-    zero = np.float32(0)
-    pixel_areas(edges, charges, pattern, False, zero, zero, 0, shape[0], out)
+    zero = np.zeros(MODES, np.float32)
+    pixel_areas(edges, charges, pattern, False, zero, 0, shape[0], out)
     return out
 
 

@@ -243,7 +243,7 @@ class SiliconSensor(EngineSensor):
         )
         none = np.zeros((0, 0), np.float32)
         physics = Physics(
-            edges, Response(none, none, 1.0, 1.0, np.inf, np.inf), medium, np.inf,
+            edges, Response(none, none[..., None], 1.0, 1.0, np.inf, np.inf), medium, np.inf,
             not self.transpose, self.effective_nrecalc, False,
             surroundings=outside_charge(self.surroundings),
         )  # fmt: skip
@@ -295,7 +295,7 @@ def _edges(
     # Where the factor is 1 to single precision, edges are looked up faster.
     scale[scale > 1 - 5e-7] = 1.0
     return make_edges(
-        (per_electron * sides[0][None], per_electron * sides[1][None]), None, points,
+        [(per_electron * sides[0][None], per_electron * sides[1][None])], points,
         np.array([thickness]), reach, scale=scale,
     )  # fmt: skip
 

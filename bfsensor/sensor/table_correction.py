@@ -258,11 +258,7 @@ def correct_table(
     factors = _factored(table, charge_response, background)
     weights = _weights(factors, table, wavelengths, photons, temperature)
     patterns = _Patterns(
-        [
-            _patterns(sides, factors.points, weights)
-            for sides in (factors.first, factors.second)
-            if sides is not None
-        ]
+        [_patterns(sides, factors.points, weights) for sides in factors.modes]
     )
     bad = _masked(given, mask)
     scene = _Scene(given, *_without_masked(given, bad), around)
@@ -459,13 +455,13 @@ def _bands(
         fixed = None if scene.light is None else scene.field(scene.light, rows, margin)
         given, light = charge, charge
         inside = (margin - top, margin - top + ny), (margin, margin + nx)
-        charges = np.zeros((2, *charge.shape), np.float32)
+        charges = np.zeros((1 + kernels.NEAR_MODES, *charge.shape), np.float32)
         on, across = (np.empty((2, *charge.shape), np.float32) for _ in range(2))
         corners = np.empty_like(charge)
         moved = np.empty((2, *charge.shape), np.float32)
         for n in range(PASSES):
             kernels.mean_charges(
-                light, charge, response.first, response.second, response.charge_step,
+                light, charge, response.first, response.near, response.charge_step,
                 response.background_step, times, parts, charges,
             )  # fmt: skip
             bright = light if fixed is None else np.where(fixed == given, light, fixed)

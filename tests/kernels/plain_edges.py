@@ -7,6 +7,7 @@ import numpy as np
 from bfsensor._kernels import edges as kernel
 from bfsensor._kernels.compile_options import from_python
 from bfsensor._kernels.photons import Pattern
+from bfsensor._kernels.shifts import MODES
 from bfsensor.device.shipped import tables_dir
 from bfsensor.sensor.charge_response import factor_table
 from bfsensor.sensor.edge_weights import make_edges
@@ -18,7 +19,7 @@ from bfsensor.table.table import DistortionTable
 collect = from_python(kernel.collect)
 
 NEAR = 1
-"""Reach of the second mode [pixel]."""
+"""Reach of the other modes [pixel]."""
 
 
 # -- sensors ---------------------------------------------------------------------------
@@ -62,14 +63,13 @@ def silicon_sensor(predict=False):
 
 @cache
 def table_sensor(linear=False):
-    """Our table of the ITL STA3800C: two modes, 48 layers, a response."""
+    """Our table of the ITL STA3800C: all modes, 48 layers, a response."""
     table = DistortionTable.read(tables_dir() / "itl_sta3800c" / "table.fits")
     f = factor_table(table, linear=linear)
-    modes = [f.first] if f.second is None else [f.first, f.second]
-    edges = make_edges(f.first, f.second, f.points, f.heights, table.reach)
+    edges = make_edges(f.modes, f.points, f.heights, table.reach)
     medium = silicon_sensor().physics.medium
     physics = Physics(edges, f.response, medium, np.inf, True, 0.0, predict=True)
-    return Sensor(physics, modes, lambda z: 1.0)
+    return Sensor(physics, f.modes, lambda z: 1.0)
 
 
 NO_PATTERN = Pattern(
@@ -99,8 +99,24 @@ def find_pixels(sensor, exposure, x, y, z, edges=None, hot=None):
 # -- the plain twin --------------------------------------------------------------------
 
 
+def response_grids(sensor):
+    """Effective charge of each mode, by charge and background."""
+    r = sensor.physics.response
+    return [r.first.astype(float), *np.moveaxis(r.near.astype(float), -1, 0)]
+
+
+def charge_planes(charges):
+    """Effective charges with one mode after the other, shape (modes, pixels with padding)."""
+    return np.stack([charges.first, *charges.near.reshape(charges.first.size, -1).T])
+
+
+def lows_by_tile(charges):
+    """Charge that sums start from, shape (tiles, modes)."""
+    return charges.lows.reshape(-1, MODES)
+
+
 def effective_charges(sensor, image):
-    """Effective charges of both modes, by two linear interpolations in a plain loop."""
+    """Effective charges of all modes, by two linear interpolations in a plain loop."""
     r = sensor.physics.response
     q = np.asarray(image, float)
     if r.first.size == 0:
@@ -116,7 +132,7 @@ def effective_charges(sensor, image):
     out = []
     charges = np.arange(r.first.shape[0]) * r.charge_step
     last = r.first.shape[1] - 2
-    for grid in (r.first.astype(float), r.second.astype(float)):
+    for grid in response_grids(sensor):
         found = np.zeros((ny, nx))
         for j in range(ny):
             for i in range(nx):
@@ -133,7 +149,7 @@ def effective_charges(sensor, image):
     return out
 
 
-def displace(sensor, image, layer, lows=(0.0, 0.0)):
+def displace(sensor, image, layer, lows=(0.0,) * MODES):
     """Displaced points [pixel] of all sides of an image, source by source.
 
     ``lows``: charge of the uniform sheet that is taken off, by mode.
@@ -150,7 +166,7 @@ def displace(sensor, image, layer, lows=(0.0, 0.0)):
     reaches = (sensor.physics.edges.reach, NEAR)
     charges = effective_charges(sensor, image)
     for mode, (q, low) in enumerate(zip(charges, lows, strict=False)):
-        sides, reach = sensor.modes[mode], reaches[mode]
+        sides, reach = sensor.modes[mode], reaches[min(mode, 1)]
         upright, flat = (side[layer] for side in sides)
         middle = upright.shape[0] // 2
         for j in range(ny):
@@ -176,7 +192,7 @@ def displace_sheet(sensor, layer, mode):
 
     The sheet goes on beyond the image: every side has all of its sources.
     """
-    reach = (sensor.physics.edges.reach, NEAR)[mode]
+    reach = NEAR if mode else sensor.physics.edges.reach
     upright, flat = (side[layer] for side in sensor.modes[mode])
     middle = upright.shape[-4] // 2
     across = slice(middle - reach, middle + reach + 1)
@@ -364,9 +380,7 @@ def lowest_charges(sensor, image):
     """Charge taken off by the kernel, where all tiles have the same or it does nothing."""
     charges = expose(sensor, image).charges
     out = []
-    for mode, low in enumerate(
-        (charges.low_first, charges.low_second)[: len(sensor.modes)]
-    ):
+    for mode, low in enumerate(lows_by_tile(charges).T[: len(sensor.modes)]):
         upright, flat = displace_sheet(sensor, slice(None), mode)
         spread = float(np.ptp(low))
         assert spread * np.abs(upright[..., 0]).max() < 2e-6

@@ -4,12 +4,15 @@ import numpy as np
 import pytest
 
 from bfsensor._kernels.areas import pixel_areas, times_ring_areas
+from bfsensor._kernels.shifts import MODES
 from tests.kernels.plain_edges import (
     IMAGES,
     NO_PATTERN,
+    charge_planes,
     displace,
     draw_sides,
     expose,
+    lows_by_tile,
     make_image,
     polygon,
     silicon_sensor,
@@ -21,14 +24,20 @@ from tests.kernels.test_photons import PATTERNS, plain_shift
 def find_areas(sensor, image, *, pattern=NO_PATTERN, flux=True, lows=None, rows=None):
     charges = expose(sensor, image).charges
     if lows is None:
-        lows = charges.low_first.min(), charges.low_second.min()
+        lows = lows_by_tile(charges).min(0)
     out = np.full(image.shape, np.nan)
     first, last = (0, image.shape[0]) if rows is None else rows
     pixel_areas(
-        sensor.physics.edges, charges, pattern, flux, np.float32(lows[0]),
-        np.float32(lows[1]), first, last, out,
-    )  # fmt: skip
-    return out, (float(lows[0]), float(lows[1]))
+        sensor.physics.edges,
+        charges,
+        pattern,
+        flux,
+        np.asarray(lows, np.float32),
+        first,
+        last,
+        out,
+    )
+    return out, np.asarray(lows, float)
 
 
 def area(corners):
@@ -77,12 +86,13 @@ def test_areas_less_a_sheet_of_charge_are_those_of_the_polygons(make):
     sensor = make()
     image = make_image("random", (9, 10))
     # Not the lowest charge: next to corners it moves points along the edges by 1e-2.
-    lows = 1.1e5, -3e4 * (sensor.layers > 1)
+    lows = np.array([1.1e5, -3e4, 2e4, 1e4])
+    lows[1:] *= sensor.layers > 1
     found, _ = find_areas(sensor, image, lows=lows)
     expected = plain_areas(sides_of(sensor, image, lows), image.shape)
     # As above.
     assert np.abs(found - expected).max() < 1e-6
-    plain = plain_areas(sides_of(sensor, image, (0.0, 0.0)), image.shape)
+    plain = plain_areas(sides_of(sensor, image, np.zeros(MODES)), image.shape)
     assert np.abs(found - plain).max() > 1e-4
 
 
@@ -103,7 +113,9 @@ def test_a_uniform_charge_changes_no_area(make):
     charges = expose(sensor, image).charges
     inner = (slice(6, -6), slice(6, -6))
     at = 12 * charges.stride + 12
-    lows = charges.first[at], charges.second[at] if charges.second.size else 0.0
+    lows = np.zeros(MODES)
+    planes = charge_planes(charges)
+    lows[: len(planes)] = planes[:, at]
     found, _ = find_areas(sensor, image, lows=lows)
     # Taken off, it leaves rounding: shifts of 1e5 x 1.2e-6 that cancel, 1e-8 each.
     assert np.abs(found[inner] - 1).max() < 1e-6
@@ -113,9 +125,9 @@ def test_a_uniform_charge_changes_no_area(make):
     # a corner along an edge), for the windows of edges that meet there differ: a pixel
     # then lacks at most four triangles of t x t / 2.
     edges = sensor.physics.edges
-    sums = edges.sums.reshape(2, edges.layers, 2, edges.points.size, 2)[:, -1, ..., 0]
+    sums = edges.sums.reshape(2, edges.layers, 2, edges.points.size, MODES)[:, -1, ..., 0]
     t = 1e5 * np.abs(sums).max()
-    found, _ = find_areas(sensor, image, lows=(0.0, 0.0))
+    found, _ = find_areas(sensor, image, lows=np.zeros(MODES))
     assert np.abs(found[inner] - 1).max() < 2 * t**2 + 1e-6
 
 

@@ -10,11 +10,15 @@ from bfsensor._kernels import charge as kernel
 from bfsensor._kernels.charge import TILE
 from bfsensor._kernels.compile_options import from_python
 from bfsensor._kernels.deposit import close_block, deposit
+from bfsensor._kernels.shifts import MODES
 from bfsensor.sensor.image_exposure import as_pixels
 from tests.kernels.plain_edges import (
+    charge_planes,
     effective_charges,
     expose,
+    lows_by_tile,
     make_image,
+    response_grids,
     silicon_sensor,
     table_sensor,
 )
@@ -155,7 +159,7 @@ def throw(exposure, image, count, seed, flux=(1.0, 0.5, 3.0, -0.25)):
 def same_charges(exposure, fresh):
     """Whether two exposures hold the same charges, bit for bit."""
     a, b = exposure.charges, fresh.charges
-    return np.array_equal(a.first, b.first) and np.array_equal(a.second, b.second)
+    return np.array_equal(a.first, b.first) and np.array_equal(a.near, b.near)
 
 
 @pytest.mark.parametrize("predict", [False, True])
@@ -189,12 +193,10 @@ def test_a_small_block_gives_the_charge_of_the_image(make):
 def check_ranges(sensor, exposure):
     """The ranges of tiles enclose what they hold, and margins follow from ranges."""
     charges, ledger = exposure.charges, exposure.ledger
-    for values, low, high in (
-        (charges.first, charges.low_first, ledger.high_first),
-        (charges.second, charges.low_second, ledger.high_second),
+    all_lows, all_highs = lows_by_tile(charges), ledger.highs.reshape(-1, MODES)
+    for values, low, high in zip(
+        charge_planes(charges), all_lows.T, all_highs.T, strict=False
     ):
-        if values.size == 0:
-            continue
         pixels = inside(charges, values)
         tiles_x = -(-charges.nx // kernel.TILE)
         tiles_y = -(-charges.ny // kernel.TILE)
@@ -212,8 +214,8 @@ def check_ranges(sensor, exposure):
     assert not ledger.flags.any() and ledger.counters[kernel.FLAGGED] == 0
     # The margins are those of these ranges: the bound for the tile and its neighbours.
     shape = (-(-charges.ny // kernel.TILE), -(-charges.nx // kernel.TILE))
-    lows = charges.low_first.reshape(shape)
-    highs = ledger.high_first.reshape(shape)
+    lows = all_lows[:, 0].reshape(shape)
+    highs = all_highs[:, 0].reshape(shape)
     margins = charges.margins.reshape(shape)
     for row in range(shape[0]):
         for column in range(shape[1]):
@@ -334,7 +336,7 @@ def tolerance_of(sensor, mode):
     r = sensor.physics.response
     if r.first.size == 0:
         return ROUNDING
-    grid = (r.first, r.second)[mode].astype(float)
+    grid = response_grids(sensor)[mode]
     slope = np.abs(np.diff(grid, axis=1)).max() / r.background_step
     return ROUNDING + STALE * slope
 
@@ -350,8 +352,8 @@ def test_the_background_of_listed_pixels_is_stale_by_its_bound_at_most(seed):
         throw(exposure, image, 9000, int(rng.integers(1000, 10**6)))
         close(sensor, exposure, image, 0.0)
         fresh = expose(sensor, image)
-        for mode, name in enumerate(("first", "second")):
-            stale = np.abs(getattr(exposure.charges, name) - getattr(fresh.charges, name))
+        planes = charge_planes(exposure.charges), charge_planes(fresh.charges)
+        for mode, stale in enumerate(np.abs(planes[0] - planes[1])):
             largest = max(largest, stale.max())
             assert stale.max() < tolerance_of(sensor, mode)
         check_ranges(sensor, exposure)
@@ -387,7 +389,7 @@ def test_effective_charges_are_those_of_the_plain_twin(name):
     image = make_image(name, (20, 37))
     charges = expose(sensor, image).charges
     for found, expected in zip(
-        (charges.first, charges.second), effective_charges(sensor, image), strict=True
+        charge_planes(charges), effective_charges(sensor, image), strict=True
     ):
         assert np.abs(inside(charges, found) - expected).max() < ROUNDING
         # Outside the image there is none.

@@ -7,6 +7,7 @@ import pytest
 from scipy.ndimage import correlate1d
 
 from bfsensor._kernels import correction
+from bfsensor._kernels.shifts import MODES, NEAR_MODES
 
 pytestmark = pytest.mark.kernels
 
@@ -63,10 +64,11 @@ def test_what_moved_is_given_back_without_loss():
 def test_charges_of_a_linear_response():
     rng = np.random.default_rng(4)
     light, image = rng.uniform(0, 100, (2, 4, 5))
-    out = np.zeros((2, 4, 5))
+    out = np.zeros((MODES, 4, 5))
     empty = np.zeros((0, 0), np.float32)
+    near = np.zeros((0, 0, NEAR_MODES), np.float32)
     times, weights = np.array([0.25, 0.75]), np.array([0.5, 0.5])
-    correction.mean_charges(light, image, empty, empty, 1.0, 1.0, times, weights, out)
+    correction.mean_charges(light, image, empty, near, 1.0, 1.0, times, weights, out)
     expected = 0.5 * light + 0.3125 * (image - light)
     np.testing.assert_allclose(out[0], expected, rtol=1e-12)
-    assert not out[1].any()
+    assert not out[1:].any()

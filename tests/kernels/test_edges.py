@@ -19,6 +19,7 @@ from tests.kernels.plain_edges import (
     draw_sides,
     expose,
     find_pixels,
+    lows_by_tile,
     make_image,
     scatter,
     silicon_sensor,
@@ -110,12 +111,12 @@ def test_edges_beyond_a_tile_of_charge_without_an_end(sensor):
     image = 3e4 + make_image("random", (48, 50)) / 3
     exposure = expose(sensor, image)
     layer = sensor.layers - 1
-    assert exposure.charges.low_first.reshape(3, 4)[1, 1] > 0
+    assert lows_by_tile(exposure.charges)[5, 0] > 0
     z = 99.0
     rng = np.random.default_rng(40999)
     for row, column in ((1, 1), (2, 3)):
         tile = row * 4 + column
-        lows = exposure.charges.low_first[tile], exposure.charges.low_second[tile]
+        lows = lows_by_tile(exposure.charges)[tile]
         shifts = displace(sensor, image, layer, lows)
         sides = draw_sides(sensor, shifts, sensor.factor(z))
         x, y = scatter(sides, 40000, int(rng.integers(3000, 9000)))
@@ -144,7 +145,7 @@ def test_margins_are_bounds(sensor, name, pedestal):
         for row in range(tiles_y):
             for column in range(tiles_x):
                 tile = row * tiles_x + column
-                lows = charges.low_first[tile], charges.low_second[tile]
+                lows = lows_by_tile(charges)[tile]
                 vertical, horizontal = (
                     side
                     - sum(low * sheet[n] for low, sheet in zip(lows, sheets, strict=False))

@@ -56,7 +56,7 @@ def test_a_stamp_after_another_is_that_of_a_new_sensor(options, dtype):
         (sensor._exposure.charges, fresh._exposure.charges),
         (sensor._exposure.ledger, fresh._exposure.ledger),
     ):
-        for name in ("first", "second", "margins", "ranges", "carry", "strikes", "sums"):
+        for name in ("first", "near", "margins", "ranges", "carry", "strikes", "sums"):
             if hasattr(one, name):
                 assert np.array_equal(getattr(one, name), getattr(other, name)), name
 

@@ -11,6 +11,7 @@ from bfsensor._kernels import surroundings
 from bfsensor._kernels.compile_options import from_python
 from bfsensor._kernels.shifts import Charges
 from bfsensor.errors import SensorError
+from tests.kernels.plain_edges import charge_planes
 
 KINDS = pytest.mark.parametrize("kind", [SiliconSensor, BrighterFatterSensor])
 LEVEL = 2e4
@@ -87,9 +88,7 @@ def test_photons_meet_the_mirror_image_as_it_is_at_each_renewal(kind, dense):
     charges = sensor._exposure.charges
     pad, shape = charges.pad, (charges.ny + 2 * charges.pad, charges.stride)
     seen = 0
-    for array in (charges.first, charges.second):
-        if not array.size:
-            continue
+    for array in charge_planes(charges):
         grid = array[: shape[0] * shape[1]].reshape(shape)[:, : charges.nx + 2 * pad]
         inner = grid[pad:-pad, pad:-pad]
         np.testing.assert_array_equal(grid, np.pad(inner, pad, mode="symmetric"))
@@ -170,27 +169,28 @@ def test_flats_need_no_frame_that_is_drawn_and_cut_off(kind):
     ).all()
 
 
+@pytest.mark.parametrize("each", [1, 3])
 @pytest.mark.parametrize("shape", [(1, 1), (2, 5), (7, 3), (30, 12)])
-def test_single_pixels_are_mirrored_as_the_whole_image(shape):
+def test_single_pixels_are_mirrored_as_the_whole_image(shape, each):
     ny, nx = shape
     pad, stride = 7, nx + 14 + 16
     none = np.zeros(0, np.float32)
-    charges = Charges(
-        none, none, stride, pad, nx, ny, none, none, none, np.zeros(0, np.int64)
-    )
-    whole = np.zeros((ny + 2 * pad) * stride + 16, np.float32)
-    grid = whole[: (ny + 2 * pad) * stride].reshape(-1, stride)[:, : nx + 2 * pad]
-    pixels = np.random.default_rng(1).uniform(1, 2, shape).astype(np.float32)
+    charges = Charges(none, none, stride, pad, nx, ny, none, none, np.zeros(0, np.int64))
+    whole = np.zeros(each * ((ny + 2 * pad) * stride + 16), np.float32)
+    size = each * (ny + 2 * pad) * stride
+    grid = whole[:size].reshape(-1, stride, each)[:, : nx + 2 * pad]
+    pixels = np.random.default_rng(1).uniform(1, 2, (*shape, each)).astype(np.float32)
     grid[pad : pad + ny, pad : pad + nx] = pixels
     one = whole.copy()
     mirror_all, mirror_pixel = map(
         from_python, (surroundings.mirror_all, surroundings.mirror_pixel)
     )
-    mirror_all(charges, whole)
-    np.testing.assert_array_equal(grid, np.pad(pixels, pad, mode="symmetric"))
+    mirror_all(charges, whole, each)
+    around = (pad, pad), (pad, pad), (0, 0)
+    np.testing.assert_array_equal(grid, np.pad(pixels, around, mode="symmetric"))
     for j in range(ny):
         for i in range(nx):
-            mirror_pixel(charges, one, j, i)
+            mirror_pixel(charges, one, each, j, i)
     np.testing.assert_array_equal(one, whole)
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from bfsensor import BrighterFatterSensor, DistortionTable
 from bfsensor._kernels import correction
+from bfsensor._kernels.shifts import MODES
 from bfsensor.device.shipped import tables_dir
 from bfsensor.device.silicon import absorption_length
 from bfsensor.errors import BFSensorError
@@ -68,11 +69,12 @@ def test_charges_are_averaged_over_an_exposure():
     light = rng.uniform(1e4, 5e4, (5, 7))
     image = light * rng.uniform(0.95, 1.05, (5, 7))
     charge, background = np.arange(0.0, 2e5, 1e3)[:, None], np.arange(0.0, 1e5, 2e3)
-    grids = [charge + 1e-6 * charge**2 + 0 * background, 3e-7 * background**2 + 0 * charge]
+    first = charge + 1e-6 * charge**2 + 0 * background
+    near = np.arange(1, MODES) * (3e-7 * background**2 + 0 * charge)[..., None]
     times, weights = np.polynomial.legendre.leggauss(2)
-    out = np.zeros((2, 5, 7))
+    out = np.zeros((MODES, 5, 7))
     correction.mean_charges(
-        light, image, *(g.astype(np.float32) for g in grids), 1e3, 2e3, 0.5 * (times + 1),
+        light, image, first.astype(np.float32), near.astype(np.float32), 1e3, 2e3, 0.5 * (times + 1),
         0.5 * weights, out,
     )  # fmt: skip
     fine = (np.arange(2000) + 0.5) / 2000
@@ -85,7 +87,8 @@ def test_charges_are_averaged_over_an_exposure():
     b = held(fine, *around)
     # Between the steps of the grids parabolas are chords: up to 0.25 and 0.3 e- too large.
     assert out[0, 2, 3] == pytest.approx(np.mean(q + 1e-6 * q**2), abs=0.5)
-    assert out[1, 2, 3] == pytest.approx(np.mean(3e-7 * b**2), abs=0.5)
+    for n in range(1, MODES):
+        assert out[n, 2, 3] == pytest.approx(n * np.mean(3e-7 * b**2), abs=0.5 * n)
 
 
 # -- images ----------------------------------------------------------------------------
