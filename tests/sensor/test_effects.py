@@ -207,7 +207,7 @@ def test_bend_of_the_whole_table_is_differential():
         areas_of(sensor_with(*e), charges)[8:-8, 8:-8] - 1 for e in ((), (Bent({"b": b}),))
     ]
     ratio = (changes[0] * changes[1]).sum() / (changes[0] ** 2).sum()
-    # The next order is b times the fluctuations; both modes interpolate in the background.
+    # The next order is b times the fluctuations; all modes interpolate in the background.
     assert ratio == pytest.approx(1 + b * level, abs=3e-3)
 
 
