@@ -31,6 +31,7 @@ def mean_charges(
     per_charge = 1.0 / charge_step
     per_background = 1.0 / background_step
     # Sums of three rows, with a column more on either side.
+    sums = np.empty(NEAR_MODES)
     lights = np.empty(nx + 2)
     images = np.empty(nx + 2)
     for y in range(ny):
@@ -51,8 +52,7 @@ def mean_charges(
                 0.125 * (images[x] + images[x + 1] + images[x + 2] - image[y, x]) - around
             )
             one = 0.0
-            for m in range(NEAR_MODES):
-                out[1 + m, y, x] = 0.0
+            sums[:] = 0.0
             for n in range(times.size):
                 t = times[n]
                 q = t * (own + t * gained)
@@ -73,10 +73,11 @@ def mean_charges(
                 one += w00 * first[i, j] + w01 * first[i, j + 1]
                 one += w10 * first[i + 1, j] + w11 * first[i + 1, j + 1]
                 for m in range(NEAR_MODES):
-                    more = w00 * near[i, j, m] + w01 * near[i, j + 1, m]
-                    more += w10 * near[i + 1, j, m] + w11 * near[i + 1, j + 1, m]
-                    out[1 + m, y, x] += more
+                    sums[m] += w00 * near[i, j, m] + w01 * near[i, j + 1, m]
+                    sums[m] += w10 * near[i + 1, j, m] + w11 * near[i + 1, j + 1, m]
             out[0, y, x] = one
+            for m in range(NEAR_MODES):
+                out[1 + m, y, x] = sums[m]
 
 
 @numba.njit(**OPTIONS)
