@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from bfsensor import BrighterFatterSensor, DistortionTable, SiliconSensor
-from bfsensor._kernels.areas import pixel_areas
+from bfsensor._kernels.areas import charge_ranges, pixel_areas
+from bfsensor._kernels.shifts import MODES
 from bfsensor.device.shipped import tables_dir
-from bfsensor.sensor.area_kernels import _lowest
 from bfsensor.sensor.flats import draw_flat
 from bfsensor.sensor.image_exposure import ImageExposure
 from tests.kernels.plain_edges import NO_PATTERN
@@ -20,10 +20,11 @@ def polygons(sensor, image):
     """Areas by the kernel that walks around each pixel, which is tested against numpy."""
     charges = ImageExposure(image, sensor._physics, NO_PATTERN, (0.0, 0.0), (0, 0)).charges
     out = np.empty(image.shape)
+    lows, highs = np.empty((2, MODES), np.float32)
+    charge_ranges(charges, lows, highs)
     pixel_areas(
-        sensor._physics.edges, charges, NO_PATTERN, True, *_lowest(charges), 0,
-        image.shape[0], out,
-    )  # fmt: skip
+        sensor._physics.edges, charges, NO_PATTERN, True, lows, 0, image.shape[0], out
+    )
     return out
 
 
