@@ -171,7 +171,7 @@ class _Modes:
 def _split(
     sides: list[FloatArray], means: FloatArray, g1: FloatArray, weight: FloatArray
 ) -> _Modes:
-    """Split the response into the far mode, and the leading modes of what it leaves nearby.
+    """Split the response into the mode of far edges, and further modes of the edges beside the source.
 
     ``means`` [level, depth, side]: mean normal shifts, which areas are made of and amplitudes found by.
     """

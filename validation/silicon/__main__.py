@@ -61,7 +61,8 @@ SMALLEST, LARGEST = 0.5, 15.0
 VOLTS = {"operating_point.back_bias": 1.0, "operating_point.gate_high": 0.3}
 """Typical changes of voltages [V], of which device files state no uncertainty."""
 SIZES, QUANTITIES, SMALL = (1.5, 3.0, 4.5), 10, 1e-3
-"""Of the ladder: sizes and step of derivatives [uncertainties], and number of quantities."""
+"""Of the ladder: sizes and step of derivatives [uncertainties], and number of quantities.  Chosen: the
+sizes within and beyond what a prior allows; twice as many quantities are twice as many cases."""
 OUTSIDE = {DOTS: -100.0, BLUR: 2e-5}
 """Typical changes that no piece describes: dose of dots [e/um2], share of charge that moves."""
 
@@ -261,6 +262,7 @@ def ladder(folder: Path, truths: Path, seed: int, device: str) -> None:
     for (name, spread), dkx, dky in zip(known.items(), found.dkx, found.dky, strict=True):
         x, y = spread * dkx[-1], spread * dky[-1]
         sizes[name] = float(np.linalg.norm(x - np.roll(x, 1, 1) + y - np.roll(y, 1, 0)))
+    allowed = quantities(card)
     n = 0
     for name in sorted(sizes, key=lambda q: -sizes[q])[:QUANTITIES]:
         for size in SIZES:
@@ -277,6 +279,9 @@ def ladder(folder: Path, truths: Path, seed: int, device: str) -> None:
                     "engine": "poisson",
                     "outside": False,
                 }
+                value = parameter_value(card, name) + change[name]
+                if not allowed[name].low <= value <= allowed[name].high:
+                    continue
                 try:
                     plain, full = tables_of(card, case, biases)
                 except (BFSensorError, ValueError):

@@ -43,6 +43,8 @@ class FittedQuantity:
     alone, alone_error : float
         Value by the recordings and the priors of all other quantities, within what it can be, and its
         standard error, in the unit of device files.
+    at_end : bool
+        Whether that value is an end of its range: of what the quantity can be, or FARTHEST off.
     gain : float
         Decrease of the chi-square at that value if the prior of this quantity is left out; for a
         device within its file at most a chi-square of one degree of freedom.
@@ -63,6 +65,7 @@ class FittedQuantity:
     pull_error: float
     alone: float
     alone_error: float
+    at_end: bool
     gain: float
     p_value: float
     odds: float
@@ -113,7 +116,8 @@ def fitted_quantities(fit: BaselineFit, baseline: Baseline) -> list[FittedQuanti
         q = FittedQuantity(
             name=name, value=nominal + pull * width, error=error * width, nominal=nominal,
             unit=baseline.units.get(name, ""), pull=pull, pull_error=error,
-            alone=nominal + alone * width, alone_error=scatter * width, gain=gain,
+            alone=nominal + alone * width, alone_error=scatter * width,
+            at_end=bool(alone != middle), gain=gain,
             p_value=min(1.0, len(pulls) * float(chi2.sf(gain, 1))),
             odds=float(inside / (high - low) / max(within, 1e-300)),
         )  # fmt: skip
@@ -139,9 +143,11 @@ def said_farthest(found: Sequence[FittedQuantity]) -> str:
     first = found[0]
     unit = f" {first.unit}" if first.unit else ""
     if np.isfinite(first.nominal):
+        error = f" +- {said_number(first.alone_error, 2)}"
         value = (
-            f"{_named(first.name)} is {said_number(first.alone)} +- "
-            f"{said_number(first.alone_error, 2)}{unit} by the recordings, nominally "
+            f"{_named(first.name)} is {said_number(first.alone)}"
+            f"{'' if first.at_end else error}{unit} by the recordings"
+            f"{', an end of what is taken as possible' if first.at_end else ''}, nominally "
             f"{said_number(first.nominal)}{unit}"
         )
     else:

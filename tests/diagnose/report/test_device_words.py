@@ -1,5 +1,6 @@
 """The quantity of a device that recordings place farthest from its file."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -68,7 +69,8 @@ def test_farthest_quantity_is_said_in_its_unit_whether_or_not_there_is_an_alarm(
     said = result.said()
     assert "background doping (silicon.background_doping) is 1.03 +- " in said
     assert "um by the recordings, nominally 1 um;" in said and "times as likely" in said
-    first = result.to_report()["device"][0]
+    first = json.loads(json.dumps(result.to_report()))["device"][0]
+    assert first["at_end"] is False
     assert first["value"] == pytest.approx(1.03, abs=0.003) and first["nominal"] == 1.0
 
 
@@ -82,6 +84,7 @@ def test_value_that_cannot_be_is_not_stated(baseline):
     found = {q.name: q for q in fitted_quantities(fit, predictor.baseline)}[NAMES[0]]
     assert found.pull_error > 0.9 and found.alone == pytest.approx(1 + 16 * 0.01)
     assert 0 < found.gain < found.pull**2 / (1 - found.pull_error**2)
+    assert found.at_end and "an end of what is taken as possible" in said_farthest([found])
 
 
 def test_device_within_its_file_is_not_said(baseline):
