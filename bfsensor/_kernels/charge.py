@@ -132,6 +132,22 @@ def _shape(image):
     return image.single.shape if image.single.size > 0 else image.double.shape
 
 
+@numba.njit(**INLINED)
+def _between(first, near, i, j, u, v, out, at):
+    """First effective charge between four points of the grid; those of pixel ``at`` go to ``out``."""
+    one, up = np.float32(1.0), np.uint64(1)
+    a, c = (one - u) * (one - v), u * (one - v)
+    d, e = (one - u) * v, u * v
+    to = np.uint64(NEAR_MODES) * at
+    for w in range(np.uint64(NEAR_MODES)):
+        out[to + w] = (
+            a * near[i, j, w] + c * near[i + up, j, w]
+            + d * near[i, j + up, w] + e * near[i + up, j + up, w]
+        )  # fmt: skip
+    below = a * first[i, j] + c * first[i + up, j]
+    return below + d * first[i, j + up] + e * first[i + up, j + up]
+
+
 @numba.njit(**INNER)
 def _effective(response, charges, backgrounds, near, count):
     """Replace charges of ``count`` pixels by the first effective charge, and find the others.
@@ -143,7 +159,7 @@ def _effective(response, charges, backgrounds, near, count):
     last_q, last_b = response.last_charge, response.last_background
     largest = last_q * per_charge
     rows, columns = np.int32(f.shape[0] - 2), np.int32(f.shape[1] - 2)
-    zero, one, up = np.float32(0.0), np.float32(1.0), np.uint64(1)
+    zero = np.float32(0.0)
     beyond = 0
     for n in range(np.uint64(count)):
         beyond += charges[n] > largest
@@ -153,17 +169,7 @@ def _effective(response, charges, backgrounds, near, count):
         j = min(np.int32(b), columns)
         u, v = np.float32(q - i), np.float32(b - j)
         m, k = np.uint64(i), np.uint64(j)
-        a, c = (one - u) * (one - v), u * (one - v)
-        d, e = (one - u) * v, u * v
-        charges[n] = (
-            a * f[m, k] + c * f[m + up, k] + d * f[m, k + up] + e * f[m + up, k + up]
-        )
-        to = np.uint64(NEAR_MODES) * n
-        for w in range(np.uint64(NEAR_MODES)):
-            near[to + w] = (
-                a * s[m, k, w] + c * s[m + up, k, w]
-                + d * s[m, k + up, w] + e * s[m + up, k + up, w]
-            )  # fmt: skip
+        charges[n] = _between(f, s, m, k, u, v, near, n)
     return beyond
 
 
@@ -383,7 +389,6 @@ def _respond(response, above, here, below, begin, first, near, start, count):
     rows = np.int32(f.shape[0] - 2)
     columns = np.int32(f.shape[1] - 2)
     zero = np.float32(0.0)
-    one = np.float32(1.0)
     up = np.uint64(1)
     beyond = 0
     for n in range(np.uint64(count)):
@@ -404,17 +409,7 @@ def _respond(response, above, here, below, begin, first, near, start, count):
         v = b - np.float32(level)
         i = np.uint64(m)
         j = np.uint64(level)
-        a, c = (one - u) * (one - v), u * (one - v)
-        d, e = (one - u) * v, u * v
-        first[at] = (
-            a * f[i, j] + c * f[i + up, j] + d * f[i, j + up] + e * f[i + up, j + up]
-        )
-        to = np.uint64(NEAR_MODES) * at
-        for w in range(np.uint64(NEAR_MODES)):
-            near[to + w] = (
-                a * s[i, j, w] + c * s[i + up, j, w]
-                + d * s[i, j + up, w] + e * s[i + up, j + up, w]
-            )  # fmt: skip
+        first[at] = _between(f, s, i, j, u, v, near, at)
     return beyond
 
 
