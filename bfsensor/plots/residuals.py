@@ -353,7 +353,7 @@ def draw_parameters(
     )
     ax.set_yticks(range(len(names)), names)
     ax.axvspan(-1, 1, color="0.9", zorder=0)
-    ax.set_xlabel("difference from nominal [spread of prior]")
+    ax.set_xlabel("difference from nominal\n[spread of prior]")
 
 
 def _legend(ax: Axes, columns: int) -> None:
