@@ -139,7 +139,7 @@ class Convolution:
         self._lows, highs = np.empty((2, MODES), np.float32)
         charge_ranges(charges, self._lows, highs)
         low = self._lows[0]
-        inner = float((highs - self._lows).max())
+        inner = highs - self._lows
         self._planes = np.zeros((NEAR_MODES, 0), np.float32)
         ny, nx = charges.ny, charges.nx
         # Single precision is good to 1e-7 and twice as fast; small images, where the time hardly
@@ -154,7 +154,8 @@ class Convolution:
         outer = inner
         if not np.isnan(outside):
             above = float(low) - outside
-            outer = max(inner, abs(above), above + inner)
+            most = float(inner.max())
+            outer = np.full_like(inner, max(most, abs(above), above + most))
         self._parts = [
             (_chosen(kernels, spread, kind), area)
             for spread, area in (
@@ -178,10 +179,14 @@ class Convolution:
 
 
 def _chosen(
-    kernels: AreaKernels, spread: float, kind: type[np.floating]
+    kernels: AreaKernels, spreads: NDArray[np.float32], kind: type[np.floating]
 ) -> tuple[NDArray[np.floating], NDArray[np.floating], FloatArray]:
-    """Kernels of all modes that matter for a spread of charge, and their factors, by eight."""
-    count = int(np.sum(np.abs(kernels.values) * (0.5 * spread) ** 2 > _SMALL_AREA))
+    """Kernels of all modes that matter for spreads of charge by mode, and their factors, by eight."""
+    first, near = ((part**2).sum((-2, -1)) for part in kernels.squares)
+    shares = np.column_stack([first, near])
+    largest = shares @ (0.5 * spreads[: shares.shape[1]].astype(float)) ** 2
+    large = np.flatnonzero(np.abs(kernels.values) * largest > _SMALL_AREA)
+    count = int(large[-1]) + 1 if large.size else 0
     first, near = (
         _by_eight([linear[None], squares[:count]]).astype(kind)
         for linear, squares in zip(kernels.linear, kernels.squares, strict=True)

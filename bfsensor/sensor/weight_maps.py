@@ -28,7 +28,10 @@ def corrected_variance(
     .. math:: \mathrm{var} = L + \sigma^2 (1 - a_{00} L),
               \qquad \mathrm{cov}_{ij} = -\sigma^2 a_{ij} L ,
 
-    with the area changes :math:`a_{ij}` of the table, :math:`a_{00}` below 0.
+    with the area changes :math:`a_{ij}` of the table, :math:`a_{00}` below 0.  Electrons that came early
+    acted for longer than those that came late, which the image does not show: by this even an exact
+    correction leaves covariances of :math:`L^3 (a * a)_{ij} / 12` with the convolution :math:`a * a`,
+    0.1 to 0.3 % of the variance at 80,000 e- for LSST's devices; they are not in the variance.
 
     Parameters
     ----------

@@ -73,7 +73,7 @@ def test_without_response_to_charge_shifts_are_linear():
 
 
 def test_response_depends_on_background():
-    """On 120,000 e- the lag (1, 0) gains some 9 % less from 30,000 e- than it would."""
+    """On 120,000 e- the lag (1, 0) gains some 5 % less from 30,000 e- than it would."""
     for charge, background in ((100e3, 60e3), (150e3, 120e3)):
         on_sky = area_change(charge, background)
         assert on_sky == pytest.approx(expected_change(charge, background), rel=0.02)
@@ -81,7 +81,7 @@ def test_response_depends_on_background():
     on_sky = area_change(150e3, 120e3, lag=lag)
     assert on_sky == pytest.approx(expected_change(150e3, 120e3, lag), rel=0.01)
     ignored = area_change(150e3, 120e3, lag=lag, by_background=False)
-    assert ignored > 1.05 * on_sky
+    assert ignored > 1.03 * on_sky
 
 
 def captured(instrument, charge, at, side, count, seed):

@@ -8,7 +8,11 @@ from functools import partial
 from astropy.table import Table
 
 from validation.correction.calibration_mocks import coverage
-from validation.correction.correction_round_trip import LEVELS, flat_residuals
+from validation.correction.correction_round_trip import (
+    LEVELS,
+    flat_residuals,
+    left_by_paths,
+)
 
 Rows = Callable[[str], Table]
 """Function that reads the rows of a result by its name."""
@@ -29,7 +33,13 @@ def flats_left(device: str, i: int, j: int, rows: Rows) -> str:
     found = [
         flat_residuals(part, device, "whole", level, "table")[0][j, i] for level in LEVELS
     ]
-    return ", ".join(f"{value:+.0f}" for value in found)
+    return ", ".join(f"{value:+.1f}" for value in found)
+
+
+def flats_exact(device: str, i: int, j: int, rows: Rows) -> str:
+    """Covariance of flats that an exact correction leaves [%], from low to high levels."""
+    found = [left_by_paths(device, level, linear=False)[j, i] for level in LEVELS]
+    return ", ".join(f"{value:+.1f}" for value in found)
 
 
 def mocks_covered(within: str, rows: Rows) -> str:
@@ -44,8 +54,9 @@ CORRECTED: dict[str, Callable[[Rows], str]] = {
         for short, device in (("itl", "itl_sta3800c"), ("e2v", "e2v_ccd250"))
     },
     **{
-        f"flats left e2v {i}{j}": partial(flats_left, "e2v_ccd250", i, j)
+        f"flats {name} e2v {i}{j}": partial(function, "e2v_ccd250", i, j)
         for i, j in ((0, 0), (1, 0), (0, 1))
+        for name, function in (("left", flats_left), ("exact", flats_exact))
     },
 }
 """Texts by the names that pages have for them."""
