@@ -399,13 +399,16 @@ class Effect:
     needs: ClassVar[tuple[str, ...]] = ()
     """Words for properties that recordings must have if the effect is to be sought: 'pixels', which
     reduced recordings do not have; 'levels', as a table of a_ij of one level could equally be that
-    of another device; 'patterns', fringes or rings detected in maps, from which :meth:`starts` begin."""
+    of another device; 'patterns', fringes or rings detected in maps, from which :meth:`starts` begin;
+    'blue', covariances of flats of light whose photons can make two electrons."""
     maps_vary: ClassVar[str] = "condition"
     """With what :meth:`light_map`, :meth:`displacements` and :meth:`pattern` change: 'nothing', equal
     in all flats; 'condition', wavelength, back bias and temperature; 'exposure', also time or level."""
     response: ClassVar[str] = "linear"
     """Dependence of the changes of channels on the amplitude: 'linear'; 'quadratic', with a part of
     either order; 'rough', not smooth, so that amplitudes at starting points are kept."""
+    in_images: ClassVar[bool] = True
+    """Whether sensors can draw images with it; they refuse others."""
     scatters: ClassVar[tuple[str, ...]] = ()
     """Channels whose scatter constrains the amplitude: :meth:`modes` are proportional to it there."""
 
@@ -586,6 +589,11 @@ class Effect:
         """Variance added to spots [pixel^2], and the halo that a part of their light is in."""
         del shot, layout
         return 0.0, ()
+
+    def diffusion_growth(self, shot: Shot, layout: Layout) -> float:
+        """Growth of the variance of diffusion with the charge of a pixel [pixel^2/e-], in spots."""
+        del shot, layout
+        return 0.0
 
     # -- on pixels alone
 

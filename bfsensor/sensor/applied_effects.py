@@ -125,6 +125,11 @@ class AppliedEffects:
 
     def _check(self) -> None:
         """Refuse effects that lack a layout or a condition, or whose parameters are not allowed."""
+        unable = [e.name for e in self.effects if not e.in_images]
+        if unable:
+            raise SensorError(
+                f"effects: a sensor cannot draw {', '.join(unable)}, which a diagnosis predicts only"
+            )
         placed = self._overriding(*_BY_PLACE)
         if placed and self.layout is None:
             raise SensorError(

@@ -1,4 +1,5 @@
-"""One picture for each class of effects, drawn by the package's own operations on pixels.
+"""One picture for each class of effects, drawn by the package's own operations on pixels, and one for
+each piece of silicon physics, from results.
 
 ``python -m effect_figures FOLDER [CLASS ...]``, from ``docs/``, draws into a folder; the documentation
 draws all of them when it is built and keeps them while the code that makes them is the same.
@@ -15,6 +16,7 @@ import bfsensor
 # Modules register their pictures when they are imported.
 from effect_figures import collection, light, readout  # noqa: F401
 from effect_figures.parts import PICTURES
+from effect_figures.pieces import FILE, PIECES
 
 
 def digest() -> str:
@@ -24,6 +26,7 @@ def digest() -> str:
     for path in (
         *sorted(Path(__file__).parent.glob("*.py")),
         *sorted((root / "effects").glob("*.py")),
+        FILE,
     ):
         found.update(path.read_bytes())
     return found.hexdigest()
@@ -32,8 +35,9 @@ def digest() -> str:
 def draw_all(folder: Path, words: Iterable[str] | None = None) -> None:
     """Draw the pictures of some or of all classes into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    for word in words or PICTURES:
-        PICTURES[word].draw().savefig(folder / f"{word}.png", dpi=110)
+    every = PICTURES | {f"piece_{name}": shown for name, shown in PIECES.items()}
+    for word in words or every:
+        every[word].draw().savefig(folder / f"{word}.png", dpi=110)
 
 
 def draw_once(folder: Path) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bfsensor.diagnose.report.class_words import CLASS_WORDS
+from bfsensor.diagnose.report.class_words import CLASS_WORDS, PIECE_WORDS
 from bfsensor.effects.device_parameter import DeviceParameter
 from bfsensor.effects.library import LIBRARY
-from tests.docs.pages import load
+from tests.docs.pages import DOCS, load
 
 FIGURES, PARTS = load("effect_figures"), load("effect_figures.parts")
 LONG = ("device_parameter", "charge_loss", "saturation")
@@ -66,6 +66,19 @@ def test_the_picture_of_another_thickness_shows_it():
     # A thicker sensor lets charge act over a longer path: farther pixels gain more.
     assert (on[1:] > off[1:]).all()
     assert np.abs(right.images[0].get_array()).max() > 5
+
+
+def test_every_piece_of_silicon_physics_has_a_picture_and_its_page_shows_it():
+    pieces = load("effect_figures.pieces")
+    assert set(pieces.PIECES) == {*PIECE_WORDS, "back_bias", "gate_high", "gate_low"}
+    page = (DOCS / "concepts" / "silicon_pieces.md").read_text()
+    for name, shown in pieces.PIECES.items():
+        assert shown.caption.endswith(".") and f"effects/piece_{name}.png" in page
+        assert shown.caption in " ".join(page.split())
+        figure = shown.draw()
+        assert np.isfinite(contents(figure)).all() and figure.axes[0].texts
+        for ax in figure.axes:
+            assert ax.get_xlabel() and ax.get_ylabel()
 
 
 def test_pictures_are_kept_while_their_code_is_the_same(tmp_path, monkeypatch):

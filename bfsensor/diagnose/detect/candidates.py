@@ -21,6 +21,7 @@ from bfsensor.effects.device_parameter import device_parameters
 from bfsensor.effects.effect import Effect
 from bfsensor.effects.family import EffectFamily
 from bfsensor.effects.library import LIBRARY
+from bfsensor.effects.quantum_yield import BLUEST
 from bfsensor.errors import ConvergenceError
 
 CLOSE = 40.0
@@ -63,14 +64,21 @@ def tellable(
 ) -> list[EffectFamily]:
     """Candidates that these recordings can constrain.
 
-    Reduced recordings have no pixels, and a_ij of one level say nothing of a dependence on the
-    signal: effects that need them are left out.
+    Reduced recordings have no pixels, a_ij of one level say nothing of a dependence on the signal,
+    and photons of red light make one electron each: effects that need them are left out.
     """
     pixels = bool(predictor.layout.segments)
     levels = any(
         c.unit != PER_ELECTRON or len(np.unique(c.axes["level"])) > 1 for c in channels
     )
-    lacking = {w for w, there in (("pixels", pixels), ("levels", levels)) if not there}
+    blue = any(
+        c.word == "flat_cov"
+        and c.unit != PER_ELECTRON
+        and bool((np.asarray(c.axes["wavelength"], float) < BLUEST).any())
+        for c in channels
+    )
+    known = ("pixels", pixels), ("levels", levels), ("blue", blue)
+    lacking = {word for word, there in known if not there}
     return [k for k in kinds if not lacking & set(k.needs)]
 
 

@@ -103,7 +103,8 @@ class EffectChain:
     def leaves_spots(self) -> bool:
         """Whether effects leave growth and readout of spots unchanged, except for added light."""
         own = (
-            "edges", "law", "level_response", "bend_edges", "spot_light", "spot_image", "signal",
+            "edges", "law", "level_response", "bend_edges", "spot_light", "diffusion_growth",
+            "spot_image", "signal",
         )  # fmt: skip
         return not any(e.changes(*own) for e in self.effects)
 
@@ -223,6 +224,11 @@ class EffectChain:
         halo = tuple(part for _, parts in each for part in parts)
         axes = {k: getattr(shot, k) for k in ("wavelength", "back_bias", "temperature")}
         return variance, halo, axes
+
+    def diffusion_growth(self, condition: Condition) -> float:
+        """Growth of the variance of diffusion with the charge of a pixel [pixel^2/e-]."""
+        shot = self.shot(condition, "spot")
+        return sum(effect.diffusion_growth(shot, self.layout) for effect in self.effects)
 
     def spot_image(self, images: FloatArray, axes: Mapping[str, float]) -> FloatArray:
         """Mean images of spots [e-] after readout."""

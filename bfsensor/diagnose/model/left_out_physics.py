@@ -28,9 +28,11 @@ from bfsensor.diagnose.model.device_solver import (
     less,
 )
 from bfsensor.effects.changed_device import Moved, QuadraticTemplate, Quantity, Solution
+from bfsensor.effects.charge_diffusion import charge_diffusion
 from bfsensor.effects.device_parameter import DeviceParameter
 from bfsensor.effects.effect import Parameter
 from bfsensor.effects.family import EffectFamily, TemplateFamily
+from bfsensor.effects.quantum_yield import quantum_yield
 from bfsensor.effects.simulated_physics import (
     BentResponse,
     DiffusionWidths,
@@ -144,8 +146,9 @@ def physics_left_out(
     tuple of type
         Quantities of :data:`PIECES`, and voltages, that are no parameters of the baseline, other
         numbers of collecting gates, change with level and conversion depth (each where the
-        baseline lacks it), diffusion in the field, rings of the doping, field of the edge (where
-        the device allows it); for ``dataclasses.replace(baseline, pieces=...)``.
+        baseline lacks it), diffusion in the field and its growth with charge, photons that make two
+        electrons, rings of the doping, field of the edge (where the device allows it); for
+        ``dataclasses.replace(baseline, pieces=...)``.
 
     Notes
     -----
@@ -186,7 +189,16 @@ def physics_left_out(
     if surface:
         found.append(_depths(here, colours, kelvin, cells, keep, bent))
     drifts = {bias: _drift(one) for bias, one in here.items()}
-    found.append(_diffusion(drifts, colours, device))
+    widths = _diffusion_widths(drifts, colours, device)
+    found.append(left_out(
+        FieldDiffusion, "lateral_diffusion", "simulated", widths,
+        "Einstein's relation integrated through the device's own field",
+    ))  # fmt: skip
+    # Electrons diffuse as the device's file says, which may exceed Einstein's relation.
+    wider = plain.transport.diffusion or 1.0
+    actual = tuple((key, wider**2 * variance) for key, variance in widths.held)
+    found += [charge_diffusion(widths._replace(held=actual))]
+    found += [quantum_yield(widths._replace(held=actual))]
     found.append(_rings(drifts, colours, plain))
     # Devices that the solver of the edge's field refuses have no such candidate.
     with contextlib.suppress(DeviceError):
@@ -344,19 +356,17 @@ def _of_light(drift: Drift, values: FloatArray, wavelength: float, kelvin: float
     return float(weights @ values)
 
 
-def _diffusion(
+def _diffusion_widths(
     drifts: dict[float, Drift], colours: list[float], device: Device
-) -> EffectFamily:
+) -> DiffusionWidths:
+    """Variance of diffusion in the empty device, by wavelength and back bias."""
     kelvin = device.operating_point.temperature
     area = device.pixel.pitch_x * device.pixel.pitch_y
     held = tuple(
         ((w, bias), _of_light(drift, drift.variance, w, kelvin) / area)
         for bias, drift in drifts.items() for w in colours
     )  # fmt: skip
-    return left_out(
-        FieldDiffusion, "lateral_diffusion", "simulated", DiffusionWidths(held, kelvin),
-        "Einstein's relation integrated through the device's own field",
-    )  # fmt: skip
+    return DiffusionWidths(held, kelvin)
 
 
 def ring_shifts(

@@ -94,6 +94,17 @@ class _Light(NamedTuple):
         """Light that shifts of the upper edges sweep over."""
         return self.along_x * _swept(self.edges_y, shift)
 
+    @property
+    def spread_x(self) -> FloatArray:
+        """Light that a pixel gains across its right edge by a variance of 1 pixel^2."""
+        # Half of the gradient of the light, which is the series' second term.
+        return np.asarray(self.along_y * self.edges_x[1])
+
+    @property
+    def spread_y(self) -> FloatArray:
+        """Light that a pixel gains across its upper edge by a variance of 1 pixel^2."""
+        return np.asarray(self.along_x * self.edges_y[1])
+
 
 def _lines(
     centre: FloatArray, sigma: float, neighbours: tuple[float, float]
@@ -159,6 +170,7 @@ def grow_spots(
     neighbours: tuple[float, float] = ALONE,
     law: Law = LINEAR,
     slopes: tuple[FloatArray, FloatArray] | None = None,
+    growth: float = 0.0,
 ) -> FloatArray:
     """Calculate mean images of Gaussian spots as they build up.
 
@@ -190,6 +202,9 @@ def grow_spots(
     slopes : tuple of ndarray, optional
         Change of the shifts per electron with the charge Q of the pixel that causes them
         [pixel/e-^2]: boundaries move by these times Q^2 / 2 in addition.
+    growth : float
+        Growth of the variance of diffusion with the charge of a pixel [pixel^2/e-]: across an edge
+        light diffuses by the mean of its two pixels.
 
     Returns
     -------
@@ -232,6 +247,7 @@ def grow_spots(
             filled = [charge + f * coming for f in FILLED]
             kept_part = np.mean([np.exp(-law.lost(q)) for q in filled], axis=0)
         squared = None if bent is None else rfft2(0.5 * middle**2, s=(side, side))
+        wider = 0.5 * each * growth * middle
         if law.bend:
             middle = middle * (1 + 0.5 * law.bend * middle)
         seen = rfft2(middle, s=(side, side))
@@ -239,10 +255,16 @@ def grow_spots(
         shift_x, shift_y = irfft2(moved, s=(side, side))[..., :WING, :WING]
         gained = light.copy()
         across = each * np.sum([part.across_x(shift_x) for part in parts], axis=0)
+        if growth:
+            both_x = wider + np.roll(wider, -1, axis=-1)
+            across += both_x * np.sum([part.spread_x for part in parts], axis=0)
         across[..., -1] = 0.0
         gained += across
         gained[..., 1:] -= across[..., :-1]
         across = each * np.sum([part.across_y(shift_y) for part in parts], axis=0)
+        if growth:
+            both_y = wider + np.roll(wider, -1, axis=-2)
+            across += both_y * np.sum([part.spread_y for part in parts], axis=0)
         across[:, -1] = 0.0
         gained += across
         gained[:, 1:] -= across[:, :-1]
@@ -292,6 +314,7 @@ def predict_spots(
     neighbours: tuple[float, float] = ALONE,
     law: Law = LINEAR,
     slopes: tuple[FloatArray, FloatArray] | None = None,
+    growth: float = 0.0,
     change: Callable[[FloatArray], FloatArray] | None = None,
     places: Sequence[FloatArray] | None = None,
 ) -> dict[str, FloatArray]:
@@ -304,7 +327,7 @@ def predict_spots(
     fluxes : array_like, shape (n,)
         Fluxes of the spots as they are read, after ``change``, including charge that is lost or
         lies outside the stamp [e-].
-    halo, neighbours, law, slopes
+    halo, neighbours, law, slopes, growth
         As for :func:`grow_spots`.
     change : callable, optional
         Function of the images [e-] that applies effects after collection.
@@ -332,7 +355,7 @@ def predict_spots(
     centres = np.asarray(phases, float)
     grow = partial(
         grow_spots, kx, ky, sigma=sigma, flux=top, halo=halo, neighbours=neighbours, law=law,
-        slopes=slopes,
+        slopes=slopes, growth=growth,
     )  # fmt: skip
     # A loss that follows a root of the charge is no polynomial in the flux.
     bending = bool(law.losses)

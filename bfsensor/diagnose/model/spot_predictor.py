@@ -256,6 +256,7 @@ class SpotPredictor:
             *edges, sigma=wide,
             phases=self._phases[condition], fluxes=fluxes, halo=halo, law=chain.law,
             neighbours=self.measured.neighbours, slopes=slopes,
+            growth=chain.diffusion_growth(condition),
             change=partial(chain.spot_image, axes={**axes, **given}), places=places,
         )  # fmt: skip
 

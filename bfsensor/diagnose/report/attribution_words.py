@@ -121,9 +121,10 @@ def law_of(effect: Effect) -> tuple[str, str] | None:
     if effect.name in LAW_WORDS:
         name, said = LAW_WORDS[effect.name]
         return name, f"here {said}"
+    if effect.variant in PIECE_WORDS:
+        return effect.variant, PIECE_WORDS[effect.variant]
     if isinstance(effect, ChangedDevice):
-        piece = PIECE_WORDS.get(effect.variant)
-        return effect.variant, describe(effect.template.name) if piece is None else piece
+        return effect.variant, describe(effect.template.name)
     if effect.law_name:
         return effect.law_name, f"law: {effect.law_name.replace('_', ' ')}"
     return None

@@ -59,6 +59,8 @@ PIECE_WORDS = {
     "oxide_charge": "charge is fixed at the interface of oxide and silicon",
     "fewer_gates": "charge is stored under fewer gates, always or a part of the time",
     "more_gates": "charge is stored under more gates, always or a part of the time",
+    "charge_diffusion": "diffusion widens with the charge stored below the drifting electrons",
+    "quantum_yield": "some photons of blue or near-ultraviolet light make two electrons",
 }
 """Plain words for each piece of physics of the class silicon_physics."""
 
@@ -267,6 +269,10 @@ PARAMETER_WORDS: Mapping[str, Mapping[str, str]] = {
     "cosmic_rays": {"rate": "tracks on 256 x 256 pixels"},
     "illumination_turbulence": {
         "rms": "relative rms of the light", "corr": "correlation length",
+    },
+    "silicon_physics": {
+        "growth": "growth of the variance of diffusion with the charge of the pixel",
+        "extra": "electrons that a photon of 350 nm makes beyond one, on average",
     },
 }  # fmt: skip
 """Plain words for the parameters of each class, as defined by the class in :mod:`bfsensor.effects`;

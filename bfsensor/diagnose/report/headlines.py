@@ -138,6 +138,10 @@ HEADLINES: Mapping[str, tuple[str, ...]] = {
         "{frac} of the light of spots lies in a halo that falls within {length} pixels",
     ),
     "cosmic_rays": ("particles leave {rate} tracks a minute on 256 x 256 pixels",),
+    "silicon_physics": (
+        "diffusion widens by {growth} % (variance) per 1e5 e- of charge in the pixel",
+        "a photon of 350 nm makes {extra} electrons more than one",
+    ),
     "illumination_turbulence": (
         "the illumination changes between frames by {rms} (rms) over {corr} pixels",
     ),

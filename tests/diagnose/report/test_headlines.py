@@ -8,8 +8,11 @@ import pytest
 from bfsensor.diagnose.explain.attribution import Found
 from bfsensor.diagnose.report.class_words import CLASS_WORDS
 from bfsensor.diagnose.report.headlines import HEADLINES, _amount, headline, headlines
+from bfsensor.effects.charge_diffusion import charge_diffusion
 from bfsensor.effects.cti_serial import CtiSerial
 from bfsensor.effects.library import LIBRARY
+from bfsensor.effects.quantum_yield import quantum_yield
+from bfsensor.effects.simulated_physics import DiffusionWidths
 from bfsensor.effects.trap_serial import TrapSerial
 
 
@@ -26,7 +29,11 @@ def found_of(kind, errors=0.05):
     return Found(kind(values), 100.0, fitted, {kind.word: 1.0}, (kind.word,))
 
 
-@pytest.mark.parametrize("kind", LIBRARY, ids=lambda k: f"{k.word}:{k.variant}")
+WIDTHS = DiffusionWidths((((620.0, -50.0), 0.05),), 173.15)
+PIECES = charge_diffusion(WIDTHS), quantum_yield(WIDTHS)
+
+
+@pytest.mark.parametrize("kind", [*LIBRARY, *PIECES], ids=lambda k: f"{k.word}:{k.variant}")
 def test_every_class_has_a_headline_with_its_size(kind):
     text = headline(found_of(kind))
     assert text != CLASS_WORDS[kind.word] and "{" not in text
@@ -49,6 +56,16 @@ def test_values_are_those_of_the_effect():
         trap, 9.0, {"size": 1.0, "tau": 0.1}, {"trap_serial": 1.0}, ("trap_serial",)
     )
     assert "of amplifier 1 holds 30 +- 1.1 e-" in headline(found)
+
+
+def test_pieces_of_silicon_physics_are_said_as_a_physicist_would():
+    effect = PIECES[0]({"growth": 3.1})
+    found = Found(
+        effect, 100.0, {"growth": 0.4}, {"silicon_physics": 1.0}, ("silicon_physics",)
+    )
+    assert headline(found) == (
+        "diffusion widens by 3.1 +- 0.45 % (variance) per 1e5 e- of charge in the pixel"
+    )
 
 
 @dataclass

@@ -26,7 +26,10 @@ from bfsensor.diagnose.report.class_words import (
 from bfsensor.diagnose.report.diagnosis_result import Diagnosis
 from bfsensor.diagnose.report.html_report import write_report
 from bfsensor.diagnose.report.report_figures import SAME_PIXELS
+from bfsensor.effects.charge_diffusion import charge_diffusion
 from bfsensor.effects.library import LIBRARY
+from bfsensor.effects.quantum_yield import quantum_yield
+from bfsensor.effects.simulated_physics import DiffusionWidths
 from bfsensor.plots import residuals as show
 from tests.virtual import (
     EFFECTS,
@@ -201,9 +204,13 @@ def test_amplifiers_are_counted_from_one_in_sentences():
     assert said_value("tree_rings", "amp", 0.01) == "0.01"
 
 
+WIDTHS = DiffusionWidths((((620.0, -50.0), 0.05),), 173.15)
+
+
 def test_parameters_with_words_belong_to_their_class():
     for word, names in PARAMETER_WORDS.items():
-        own = {p.name for kind in LIBRARY if kind.word == word for p in kind.parameters}
+        kinds = (*LIBRARY, charge_diffusion(WIDTHS), quantum_yield(WIDTHS))
+        own = {p.name for kind in kinds if kind.word == word for p in kind.parameters}
         assert set(names) == own, word
 
 

@@ -74,6 +74,7 @@ def test_every_piece_is_a_candidate(lacking):
     assert {name_of(k) for k in lacking.pieces} == {
         "silicon_physics:free_holes", "silicon_physics:stop_diffusion",
         "silicon_physics:oxide_charge", "silicon_physics:fewer_gates",
+        "silicon_physics:charge_diffusion", "silicon_physics:quantum_yield",
         "bf_nonlinear:simulated", "bf_chromatic:simulated",
         "lateral_diffusion:simulated", "tree_rings:simulated", "edge_rolloff:simulated",
     }  # fmt: skip
@@ -91,6 +92,7 @@ def test_nothing_of_a_piece_changes_nothing(lacking):
             assert np.array_equal(effect.edges(*k, shot, LAYOUT), k)
             assert effect.level_response(shot, LAYOUT) is None
             assert effect.spot_light(shot, LAYOUT)[0] == 0.0
+            assert effect.diffusion_growth(shot, LAYOUT) == 0.0
             moved = effect.displacements(shot, LAYOUT)
             assert moved is None or not any(m.any() for m in moved)
 
