@@ -77,6 +77,9 @@ class _Task:
               help="FITS image of the sensor, other than 0 where light did not fill a pixel: "
               "saturated and bled ones, bad columns, cosmic rays. Saturated pixels of raw files, "
               "campaign.yaml's masks and LSST's mask planes count without it.")  # fmt: skip
+@click.option("--variance", "read_noise", type=float, metavar="ELECTRONS",
+              help="Also write the variance of each pixel, for weight maps, as further extensions "
+              "VARIANCE; the read noise [e-] is given.")  # fmt: skip
 @click.option("-o", "--output", type=click.Path(path_type=Path), required=True,
               help="File to write; with several FILES the folder for files of the same names, made "
               "if it is missing.")  # fmt: skip
@@ -108,6 +111,7 @@ def correct(
     gain: float | None,
     overscan: str,
     mask: Path | None,
+    read_noise: float | None,
     output: Path,
     measure: float | None,
     saturation: float,
@@ -149,7 +153,7 @@ def correct(
     correction = Correction(
         # Workers may have another folder.
         os.path.abspath(table) if os.path.isfile(table) else table,
-        kind, waves, photons, sky, level, threads,
+        kind, waves, photons, sky, level, threads, read_noise,
     )  # fmt: skip
     correction.check()
     options = FileOptions(gain, overscan, "" if mask is None else os.path.abspath(mask))

@@ -27,6 +27,7 @@ from bfsensor.recording.raw.overscan import find_overscan
 from bfsensor.recording.raw.sections import AmplifierLayout, layout_of, to_sensor
 from bfsensor.sensor.options import find_table, load_table
 from bfsensor.sensor.table_correction import correct_table
+from bfsensor.sensor.weight_maps import corrected_variance
 from bfsensor.table.lsst_format import solve_kernel
 from bfsensor.table.quadrant_shifts import quadrant_shifts
 from bfsensor.typing import FloatArray
@@ -101,6 +102,9 @@ class Correction:
         Charge of all pixels at which kernel and edges have their one response [e-].
     threads : int
         Threads of a correction by the whole table.
+    read_noise : float, optional
+        Standard deviation of the read noise [e-], for the variance of the corrected pixels; by default
+        no variance is written.
     """
 
     table: str
@@ -110,6 +114,7 @@ class Correction:
     sky: float = 0.0
     level: float = 0.0
     threads: int = 1
+    read_noise: float | None = None
 
     def check(self) -> None:
         """Read the table, and refuse values that are not allowed, before any image is read.
@@ -123,7 +128,9 @@ class Correction:
             raise SensorError(f"kind = {self.kind!r} must be one of {', '.join(KINDS)}")
         if not np.isfinite(self.sky):
             raise SensorError(f"sky = {self.sky} e- must be finite")
-        self.apply(np.zeros((2, 2)) - self.sky, None)
+        blank = np.zeros((2, 2)) - self.sky
+        self.apply(blank, None)
+        self.variance(blank, None)
 
     def apply(
         self, image: NDArray[Any], mask: NDArray[np.bool_] | None
@@ -166,6 +173,30 @@ class Correction:
         else:
             found = correct_edges(filled, *shifts)
         return np.where(known, found - self.sky, image), 0
+
+    def variance(
+        self, corrected: FloatArray, mask: NDArray[np.bool_] | None
+    ) -> FloatArray | None:
+        """Variance of a corrected image, see :func:`~bfsensor.sensor.corrected_variance`.
+
+        Parameters
+        ----------
+        corrected : ndarray, shape (ny, nx)
+            Corrected charge without the sky [e-].
+        mask : ndarray of bool, shape (ny, nx), optional
+            True for pixels that light did not fill.
+
+        Returns
+        -------
+        variance : ndarray, shape (ny, nx), or None
+            Variance [e-^2], infinite in masked pixels; None without a read noise.
+        """
+        if self.read_noise is None:
+            return None
+        table = load_table(*find_table(self.table))
+        return corrected_variance(
+            corrected + self.sky, table, read_noise=self.read_noise, mask=mask
+        )
 
 
 @dataclass(frozen=True)
@@ -331,7 +362,9 @@ def correct_file(
 
     The output has the extensions, shapes and headers of the input.  Pixels are in its unit, single
     precision, their overscan's level subtracted; pixels outside data sections are relative to the median
-    of the overscan.
+    of the overscan.  With a read noise each image has a further extension with its variance, named
+    VARIANCE, or VARIANCE_ and its name or number where there are several, infinite where a pixel is
+    masked or outside data sections; LSST's exposures, which have a variance, get none.
 
     Parameters
     ----------
@@ -373,7 +406,7 @@ def correct_file(
     refuse_existing(output, overwrite, RecordingError)
     parts = read_parts(path, options or FileOptions())
     summary: dict[str, Any] = {"pixels": 0, "masked": 0, "beyond": 0, "moved": 0.0}
-    found: list[tuple[AmplifierLayout, FloatArray]] = []
+    found: list[_Amplifier] = []
     for part in parts:
         image, beyond = correction.apply(part.image, part.mask)
         with np.errstate(invalid="ignore"):
@@ -382,13 +415,25 @@ def correct_file(
         summary["masked"] += int(part.mask.sum())
         summary["beyond"] += beyond
         summary["moved"] += 0.5 * float(np.nansum(change))
-        found += [
-            (layout, to_sensor(layout, image[rows, columns]) / gain)
-            for layout, gain, rows, columns in part.places
-        ]
+        variance = correction.variance(image, part.mask)
+        for layout, gain, rows, columns in part.places:
+            pixels = to_sensor(layout, image[rows, columns]) / gain
+            scatter = None
+            if variance is not None:
+                scatter = to_sensor(layout, variance[rows, columns]) / gain**2
+            found.append(_Amplifier(layout, pixels, scatter))
     cards = _cards(correction, summary)
     _write(path, output, found, cards, history)
     return summary
+
+
+@dataclass(frozen=True, eq=False)
+class _Amplifier:
+    """Corrected pixels of an amplifier and their variance, in the file's unit, in readout order."""
+
+    layout: AmplifierLayout
+    image: FloatArray
+    variance: FloatArray | None
 
 
 def _cards(
@@ -402,12 +447,18 @@ def _cards(
             ("BFWAVEL", float(np.average(waves, weights=correction.photons or None)),
              "[nm] mean wavelength of the light"),
         ]  # fmt: skip
+    noise = []
+    if correction.read_noise is not None:
+        noise = [
+            ("BFNOISE", correction.read_noise, "[electron] read noise of the variance")
+        ]
     level = [("BFLEVEL", correction.level, "[electron] level of the one response")]
     return [
         (MARK, correction.kind, "brighter-fatter correction by"),
         ("BFTABLE", Path(correction.table).name[-60:], "distortion table"),
         ("BFVERS", __version__, "version of bfsensor"),
         ("BFSKY", correction.sky, "[electron] sky added while correcting"),
+        *noise,
         *light,
         *(level if correction.kind != "table" else []),
         ("BFMASKED", summary["masked"], "pixels that light did not fill"),
@@ -418,15 +469,18 @@ def _cards(
 def _write(
     path: str | os.PathLike[str],
     output: str | os.PathLike[str],
-    found: Sequence[tuple[AmplifierLayout, FloatArray]],
+    found: Sequence[_Amplifier],
     cards: Sequence[tuple[str, Any, str]],
     history: str,
 ) -> None:
     """Write a file like the input with other pixels."""
     with open_fits(path) as hdus:
         new = fits.HDUList()
+        variances = []
+        names = [str(hdu.name).strip().upper() for hdu in hdus]
+        several = len({one.layout.hdu for one in found}) > 1
         for number, hdu in enumerate(hdus):
-            own = [(layout, image) for layout, image in found if layout.hdu == number]
+            own = [one for one in found if one.layout.hdu == number]
             if not own:
                 new.append(hdu.copy())
                 continue
@@ -434,13 +488,17 @@ def _write(
             for keyword in ("BZERO", "BSCALE", "BLANK"):
                 header.remove(keyword, ignore_missing=True)
             pixels = np.array(hdu.data, np.float32)
-            for layout, image in own:
-                _put(pixels, layout, image)
+            for one in own:
+                _put(pixels, one.layout, one.image)
             for card in cards:
                 header[card[0]] = card[1:]
             made = fits.PrimaryHDU if number == 0 else fits.ImageHDU
             new.append(made(pixels, header))
-        for card in cards if found[0][0].hdu else ():
+            if own[0].variance is not None and "VARIANCE" not in names:
+                name = f"VARIANCE_{names[number] or number}" if several else "VARIANCE"
+                variances.append(_variance_hdu(own, header, pixels.shape, name))
+        new.extend(variances)
+        for card in cards if found[0].layout.hdu else ():
             new[0].header[card[0]] = card[1:]
         if history:
             new[0].header.add_history(history)
@@ -448,12 +506,32 @@ def _write(
             new.writeto(beside, checksum=True)
 
 
-def _put(pixels: NDArray[np.float32], layout: AmplifierLayout, image: FloatArray) -> None:
-    """Put the data section of an amplifier, in readout order, into its stored image."""
+def _variance_hdu(
+    own: Sequence[_Amplifier], header: fits.Header, shape: tuple[int, ...], name: str
+) -> fits.ImageHDU:
+    """Variances of the amplifiers of an image as an extension like it."""
+    pixels = np.full(shape, np.inf, np.float32)
+    for one in own:
+        assert one.variance is not None
+        _section(pixels, one.layout)[one.layout.data] = one.variance
+    made = fits.ImageHDU(pixels, header.copy(), name=name)
+    unit = str(header.get("BUNIT", "")).strip()
+    if unit:
+        made.header["BUNIT"] = f"{unit}**2"
+    return made
+
+
+def _section(pixels: NDArray[np.float32], layout: AmplifierLayout) -> NDArray[np.float32]:
+    """View of an amplifier's stored image, in readout order."""
     window = pixels[layout.window]
-    window = window[
+    return window[
         :: -1 if layout.stored_flip_y else 1, :: -1 if layout.stored_flip_x else 1
     ]
+
+
+def _put(pixels: NDArray[np.float32], layout: AmplifierLayout, image: FloatArray) -> None:
+    """Put the data section of an amplifier, in readout order, into its stored image."""
+    window = _section(pixels, layout)
     over = find_overscan(layout)
     if over is not None:
         window -= np.nanmedian(window[over])

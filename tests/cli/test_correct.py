@@ -22,6 +22,7 @@ from bfsensor.sensor.corrected_files import (
     read_parts,
 )
 from bfsensor.sensor.table_correction import correct_table
+from bfsensor.sensor.weight_maps import corrected_variance
 from bfsensor.table.quadrant_shifts import quadrant_shifts
 
 NAME = "itl_sta3800c"
@@ -287,3 +288,68 @@ def test_wrong_use_is_refused(tmp_path):
     with pytest.raises(Exception, match=r"kind = 'magic' must be one of table, kernel"):
         Correction(NAME, "magic").check()
     assert Path(path).exists()
+
+
+def test_variances_of_an_image(tmp_path):
+    image = scene().astype(np.float32)
+    path = electrons(tmp_path / "in.fits", image)
+    mask = np.zeros(image.shape, np.uint8)
+    mask[3, 4] = 1
+    fits.PrimaryHDU(mask).writeto(tmp_path / "mask.fits")
+    out = tmp_path / "out.fits"
+    words = (
+        "--table",
+        NAME,
+        "--sky",
+        500,
+        "--variance",
+        6.0,
+        "--mask",
+        tmp_path / "mask.fits",
+    )
+    result = run(path, *words, "-o", out)
+    assert result.exit_code == 0, result.output
+    with fits.open(out) as hdus:
+        assert [hdu.name for hdu in hdus] == ["PRIMARY", "VARIANCE"]
+        assert hdus["VARIANCE"].header["BUNIT"] == "electron**2"
+        assert hdus[0].header["BFNOISE"] == 6.0
+        found, variance = hdus[0].data, hdus["VARIANCE"].data
+    assert np.isinf(variance[3, 4])
+    known = corrected_variance(found + 500.0, ITL, read_noise=6.0)
+    good = mask == 0
+    assert variance[good] == pytest.approx(known[good], rel=1e-6)
+    # The read noise of the brightest pixel is amplified by more than a tenth.
+    assert variance.flat[found.argmax()] > found.max() + 500 + 1.1 * 36
+
+
+def test_variances_of_amplifiers_are_in_their_unit_and_order(tmp_path):
+    path = raw(tmp_path / "raw.fits", scene())
+    out = tmp_path / "out.fits"
+    assert run(path, "--table", NAME, "--variance", 5.0, "-o", out).exit_code == 0
+    with fits.open(out) as hdus:
+        names = [hdu.name for hdu in hdus]
+        assert names == [
+            "PRIMARY",
+            "AMP0",
+            "AMP1",
+            "NOTES",
+            "VARIANCE_AMP0",
+            "VARIANCE_AMP1",
+        ]
+        for n, gain in enumerate((2.0, 1.6)):
+            light = gain * hdus[f"AMP{n}"].data[:, :24]
+            variance = hdus[f"VARIANCE_AMP{n}"].data
+            assert variance.shape == hdus[f"AMP{n}"].data.shape
+            assert np.isinf(variance[:, 24:]).all()
+            known = corrected_variance(light, ITL, read_noise=5.0) / gain**2
+            assert variance[:, :24] == pytest.approx(known, rel=1e-5)
+
+
+def test_a_read_noise_below_zero_is_refused_before_anything_is_written(tmp_path):
+    path = electrons(tmp_path / "in.fits", scene())
+    out = tmp_path / "out.fits"
+    result = run(path, "--table", NAME, "--variance", -1.0, "-o", out)
+    assert result.exit_code != 0 and "read_noise = -1.0" in str(
+        result.exception or result.output
+    )
+    assert not out.exists()

@@ -303,7 +303,7 @@ def traced_growth(rows: Rows, electrons: int) -> None:
 
 
 def puzzle(rows: Rows, device: Device) -> None:
-    """Growth of spots by the expected diffusion, and the one that the gap at 20,000 e- would take."""
+    """Growth of spots by the expected diffusion, and the one that direct over sensor leaves room for."""
     kelvin = device.operating_point.temperature
     old = walk(device, cells=COARSE, backgrounds=(0.0, 25e3, 50e3)).edges(None, kelvin)
     layout = Layout((64, 64), (), reference=(*USUAL, kelvin))
@@ -318,22 +318,21 @@ def puzzle(rows: Rows, device: Device) -> None:
     each = 100 * (grown.mean() - 1)
     rows.add("charge_diffusion", "growth of spots of 10 um by 1 %", each)
     measured = Table.read(RESULTS / "sensor_vs_direct.ecsv", format="ascii.ecsv")
-    gap = {
-        level: [(1 / r["ratio"] - 1, r["ratio_error"] / r["ratio"] ** 2)
-                for r in measured if r["device"] == ITL and r["level"] == level]
-        for level in (20e3, 80e3)
-    }  # fmt: skip
-    for level, found in gap.items():
-        value, error = np.array(found).T
-        weight = error**-2 / (error**-2).sum()
-        rows.add(
-            "charge_diffusion", "direct over sensor, less 1", 100 * (weight @ value),
-            error=100 / np.sqrt((error**-2).sum()), at=f"{level:g} e-",
-        )  # fmt: skip
-        rows.add(
-            "charge_diffusion", "growth that would explain it", 100 * (weight @ value) / each,
-            "% per 1e5 e-", error=100 / np.sqrt((error**-2).sum()) / each, at=f"{level:g} e-",
-        )  # fmt: skip
+    # At lower levels the mesh of the direct simulation is a larger part (boundary_growth.ecsv).
+    level = 80e3
+    value, error = np.array([
+        (1 / r["ratio"] - 1, r["ratio_error"] / r["ratio"] ** 2)
+        for r in measured if r["device"] == ITL and r["level"] == level
+    ]).T  # fmt: skip
+    weight = error**-2 / (error**-2).sum()
+    rows.add(
+        "charge_diffusion", "direct over sensor, less 1", 100 * (weight @ value),
+        error=100 / np.sqrt((error**-2).sum()), at=f"{level:g} e-",
+    )  # fmt: skip
+    rows.add(
+        "charge_diffusion", "growth that would explain it", 100 * (weight @ value) / each,
+        "% per 1e5 e-", error=100 / np.sqrt((error**-2).sum()) / each, at=f"{level:g} e-",
+    )  # fmt: skip
 
 
 def yields(rows: Rows, device: Device) -> None:

@@ -109,14 +109,8 @@ def _numbers() -> dict[str, Callable[[Rows], str]]:
         "found 5": lambda r: found(r, "diffusion, 5 %", ".2f"),
         "found half": lambda r: found(r, "diffusion, 0.5 %", ".2f"),
         "found two electrons": lambda r: found(r, "two electrons", ".2f", 100.0),
-        "gap 20": lambda r: with_error(
-            r, diffusion, "direct over sensor, less 1", ".1f", at="20000 e-"
-        ),
         "gap 80": lambda r: with_error(
             r, diffusion, "direct over sensor, less 1", ".1f", at="80000 e-"
-        ),
-        "growth for gap 20": lambda r: with_error(
-            r, diffusion, "growth that would explain it", ".0f", at="20000 e-"
         ),
         "growth for gap 80": lambda r: with_error(
             r, diffusion, "growth that would explain it", ".1f", at="80000 e-"
