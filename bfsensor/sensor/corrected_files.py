@@ -498,6 +498,7 @@ def _write(
                 name = f"VARIANCE_{names[number] or number}" if several else "VARIANCE"
                 variances.append(_variance_hdu(own, header, pixels.shape, name))
         new.extend(variances)
+        new.update_extend()
         for card in cards if found[0].layout.hdu else ():
             new[0].header[card[0]] = card[1:]
         if history:
