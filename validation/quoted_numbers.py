@@ -237,6 +237,26 @@ def predicted_covariance(rows: Rows, setting: str, lag: tuple[int, int]) -> floa
     return float(row["middle"] / row["measured"])
 
 
+def seed_hypothesis(rows: Rows, hypothesis: str, kind: str, **where: object) -> Row:
+    """Row of a fit of the seed paper's settings under a hypothesis."""
+    return one(rows("device_hypotheses"), run=f"seed, {hypothesis}", kind=kind, **where)
+
+
+def readout_evidence(rows: Rows) -> str:
+    """Twice the logarithm of the evidence that terms of the readout add in the seed paper's settings."""
+    with_it, without = (
+        float(seed_hypothesis(rows, name, "fit")["pull"])
+        for name in ("readout", "flat of 40,000 e-")
+    )
+    return f"{with_it - without:.0f}"
+
+
+def neighbour_at_30(rows: Rows, hypothesis: str, name: str) -> str:
+    """Fitted over measured covariance with the neighbour in x at -30 V, with its error."""
+    row = seed_hypothesis(rows, hypothesis, "lag", name=name, i=1, j=0)
+    return f"{row['value']:.2f} ± {row['error']:.2f}"
+
+
 def covariance_chi2(rows: Rows, setting: str) -> str:
     """Chi-square of the predicted covariances of 24 lags, without the variance."""
     table = select(rows("covariances"), setting=setting)
@@ -384,6 +404,9 @@ def _numbers() -> dict[str, Callable[[Rows], str]]:
         "least two away": lambda r: missing_two_away(r, max),
         "most two away": lambda r: missing_two_away(r, min),
         "neighbour at -30 V": lambda r: f"{predicted_covariance(r, 'seed B', (1, 0)):.1f}",
+        "seed readout evidence": readout_evidence,
+        "seed readout neighbour": lambda r: neighbour_at_30(r, "readout", "areas B, readout"),
+        "seed device neighbour": lambda r: neighbour_at_30(r, "flat of 40,000 e-", "areas B"),
         "level 16": lambda r: level_seconds(r, 16),
         "level 32": lambda r: level_seconds(r, 32),
         "iteration": lambda r: f"{max(map(float, r('benchmark')['iteration_error_V'])):.0e}",
