@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from astropy.table import Table
@@ -109,11 +110,18 @@ def _numbers() -> dict[str, Callable[[Rows], str]]:
         "found 5": lambda r: found(r, "diffusion, 5 %", ".2f"),
         "found half": lambda r: found(r, "diffusion, 0.5 %", ".2f"),
         "found two electrons": lambda r: found(r, "two electrons", ".2f", 100.0),
-        "gap 80": lambda r: with_error(
-            r, diffusion, "direct over sensor, less 1", ".1f", at="80000 e-"
-        ),
-        "growth for gap 80": lambda r: with_error(
-            r, diffusion, "growth that would explain it", ".1f", at="80000 e-"
+        **{
+            f"gap {level}": partial(
+                with_error,
+                piece=diffusion,
+                what="direct over sensor, less 1",
+                form=".1f",
+                at=f"{level}000 e-",
+            )
+            for level in (20, 80, 150)
+        },
+        "growth for gap 150": lambda r: with_error(
+            r, diffusion, "growth that would explain it", ".1f", at="150000 e-"
         ),
         "extra 350": lambda r: value(r, "quantum_yield", "extra", at="350 nm"),
         "extra 400": lambda r: value(r, "quantum_yield", "extra", at="400 nm"),
