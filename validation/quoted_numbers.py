@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -257,6 +257,13 @@ def neighbour_at_30(rows: Rows, hypothesis: str, name: str) -> str:
     return f"{row['value']:.2f} ± {row['error']:.2f}"
 
 
+def spots_mesh(rows: Rows, level: int) -> str:
+    """Growth by boundaries on 8 cells over that on 32, less 1 [%], in x and y."""
+    table = select(rows("boundary_growth"), level=1000.0 * level)
+    coarse, fine = (one(table, source=f"{n} cells") for n in (8, 32))
+    return ", ".join(f"{100 * (coarse[a] / fine[a] - 1):+.0f}" for a in "xy")
+
+
 def covariance_chi2(rows: Rows, setting: str) -> str:
     """Chi-square of the predicted covariances of 24 lags, without the variance."""
     table = select(rows("covariances"), setting=setting)
@@ -404,6 +411,7 @@ def _numbers() -> dict[str, Callable[[Rows], str]]:
         "least two away": lambda r: missing_two_away(r, max),
         "most two away": lambda r: missing_two_away(r, min),
         "neighbour at -30 V": lambda r: f"{predicted_covariance(r, 'seed B', (1, 0)):.1f}",
+        **{f"spots mesh {n}": partial(spots_mesh, level=n) for n in (20, 80, 150)},
         "seed readout evidence": readout_evidence,
         "seed readout neighbour": lambda r: neighbour_at_30(r, "readout", "areas B, readout"),
         "seed device neighbour": lambda r: neighbour_at_30(r, "flat of 40,000 e-", "areas B"),

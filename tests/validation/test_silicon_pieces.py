@@ -37,12 +37,15 @@ def test_alternating_columns_drop_out_to_first_order():
     assert two / one == pytest.approx(2, rel=0.01)
 
 
-def test_what_diffusion_linear_in_charge_would_take_differs_between_levels():
-    low, high = (
-        value("charge_diffusion", "growth that would explain it", at=f"{n} e-")
-        for n in (20000, 80000)
+def test_direct_spots_grow_more_at_all_levels_alike():
+    low, middle, high = (
+        value("charge_diffusion", "direct over sensor, less 1", at=f"{n} e-")
+        for n in (20000, 80000, 150000)
     )
-    assert low[0] - high[0] > 4 * np.hypot(low[1], high[1])
+    # Errors of one spot left out may be too small by a half.
+    for one in (low, middle):
+        assert abs(one[0] - high[0]) < 3 * np.hypot(one[1], high[1])
+    assert high[0] > 4 * high[1]
 
 
 @pytest.mark.parametrize("part", [pieces.arriving, pieces.yields])
