@@ -229,6 +229,7 @@ def expected(device: str, level: float, *, linear: bool, steps: int = 40) -> NDA
     return np.fft.ifft2(spectra(device, level, linear=linear, steps=steps)[0]).real[:8, :8]
 
 
+@lru_cache(maxsize=32)
 def spectra(
     device: str, level: float, *, linear: bool, steps: int = 40
 ) -> tuple[NDArray, NDArray]:
