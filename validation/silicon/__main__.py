@@ -3,6 +3,7 @@
 ``python -m validation.silicon make FOLDER --truths SEALED --count 24 --nulls 12 --seed 1`` draws devices
 with the scatter of the file of ``--device`` and writes a folder a case: a table of a_ij for each of two
 back biases and two wavelengths.  Truths go to SEALED, and their SHA-256 to FOLDER/commitment.json.
+With ``--engine BINARY`` half of the cases whose changes Poisson_CCD has are its own.
 ``run FOLDER REPORTS`` diagnoses each by ``bfsensor diagnose`` with the device's file as baseline.
 ``open FOLDER REPORTS SEALED --set NAME`` scores them into ``validation/results/silicon_cases.ecsv``.
 ``ladder FOLDER --truths SEALED`` makes a case for each of the ten quantities that change the a_ij most,
@@ -46,9 +47,11 @@ from validation.silicon.truths import (
     GATES,
     IMAGE_CHARGE,
     LEVEL,
+    POISSON_CCD,
     areas,
     blurred,
     by_image_charges,
+    by_poisson_ccd,
     changed,
     noise_matrix,
 )
@@ -58,6 +61,8 @@ COMMAND = "python -m validation.silicon open FOLDER REPORTS SEALED"
 WAVELENGTHS = (620.0, 950.0)
 SMALLEST, LARGEST = 0.5, 15.0
 """Range of the sizes of changes [typical changes].  Chosen: from invisible to far beyond the prior."""
+PROGRAM = "poisson_ccd"
+"""Name of the engine Poisson_CCD in truths and rows."""
 VOLTS = {"operating_point.back_bias": 1.0, "operating_point.gate_high": 0.3}
 """Typical changes of voltages [V], of which device files state no uncertainty."""
 SIZES, QUANTITIES, SMALL = (1.5, 3.0, 4.5), 10, 1e-3
@@ -86,7 +91,7 @@ def draw_case(
     engine = "poisson"
     if not outside and other != "poisson" and rng.random() < 0.5:
         engine = other
-        typical = {k: v for k, v in typical.items() if k in IMAGE_CHARGE}
+        typical = {k: v for k, v in typical.items() if engine_has(engine, k)}
     number = 2 if not outside and rng.random() < 1 / 3 else 1
     names = rng.choice(sorted(typical), size=number, replace=False)
     change = {}
@@ -99,15 +104,35 @@ def draw_case(
     return {"scatter": scatter, "change": change, "engine": engine, "outside": outside}
 
 
+def engine_has(engine: str, quantity: str) -> bool:
+    """Whether an engine has a quantity of which it can solve changes."""
+    return quantity in (POISSON_CCD if engine == PROGRAM else IMAGE_CHARGE)
+
+
 def tables_of(
-    device: Device, case: Mapping[str, Any], biases: tuple[float, ...]
+    device: Device,
+    case: Mapping[str, Any],
+    biases: tuple[float, ...],
+    binary: Path | None = None,
+    known: dict[str, NDArray[np.float64]] | None = None,
 ) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
-    """a_ij of the concealed device without and with the change, by bias and wavelength."""
+    """a_ij of the concealed device without and with the change, by bias and wavelength.
+
+    ``binary`` is Poisson_CCD, for cases of that engine, and ``known`` what it has solved.
+    """
     plain, full = [], []
     own = device.operating_point.back_bias
     for bias in biases:
         here = change_parameter(device, "operating_point.back_bias", bias - own)
         here = changed(here, case["scatter"])
+        if case["engine"] == PROGRAM:
+            if binary is None:
+                raise ValueError(f"cases of the engine {PROGRAM} need its binary")
+            solved = {} if known is None else known
+            pair = by_poisson_ccd(binary, here, case["change"], WAVELENGTHS, solved)
+            plain += pair[0]
+            full += pair[1]
+            continue
         before = areas(here, WAVELENGTHS)
         after = before
         if case["engine"] == "image charge":
@@ -199,10 +224,20 @@ def main() -> None:
     "--other", type=click.Choice(["image charge", "poisson"]), default="image charge",
     show_default=True, help="Engine of half of the cases; 'poisson' for none.",
 )  # fmt: skip
+@click.option(
+    "--engine",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Program Poisson_CCD, which then is the engine of half of the cases.",
+)
+@click.option("--alone", is_flag=True, help="Draw no cases but nulls of another engine.")
 def make(
-    folder: Path, truths: Path, count: int, nulls: int, seed: int, device: str, other: str
-) -> None:
+    folder: Path, truths: Path, count: int, nulls: int, seed: int, device: str, other: str,
+    engine: Path | None, alone: bool,
+) -> None:  # fmt: skip
     """Make cases that are not there yet."""
+    if engine is not None:
+        other = PROGRAM
+    solved: dict[str, NDArray[np.float64]] = {}
     card = Device.load(device)
     own = float(card.operating_point.back_bias)
     biases = (own, own + 15.0)
@@ -214,8 +249,10 @@ def make(
         for attempt in range(100):
             rng = np.random.default_rng([seed, n, attempt])
             case = draw_case(rng, card, n >= count, other)
+            if alone and n < count and case["engine"] != other:
+                continue
             try:
-                plain, full = tables_of(card, case, biases)
+                plain, full = tables_of(card, case, biases, engine, solved)
             except (BFSensorError, ValueError):
                 # Not every draw is a device that is depleted and holds the charge.
                 continue
