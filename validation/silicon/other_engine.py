@@ -249,8 +249,8 @@ def read_areas(path: Path, pitch: float, excess: float) -> Array:
     The areas that it writes itself are those of polygons whose corners it seeks where the boundary is
     farthest from the centre.  Boundaries between rows end at other heights on the two sides of a channel
     stop.  Here each side is a polynomial through its vertices, and corners are where these meet.  With
-    100,000 e- in one pixel of ITL, the two areas differ by up to 0.05 um^2, 5 % of a_10 and of a_11.  That
-    all pixels together keep their area has not been checked for either.
+    100,000 e- in one pixel of ITL, the two areas differ by up to 0.05 um^2, 5 % of a_10 and of a_11.
+    That all pixels together keep their area has not been checked for either.
 
     Parameters
     ----------

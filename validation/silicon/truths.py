@@ -56,10 +56,10 @@ POISSON_CCD = (
 
 Chosen after ``python -m validation.silicon.engines_compared``, and so not independent of our solver:
 changes of a_00 by doping, back bias and thickness are 5, 5 and 14 % of themselves above ours, those by
-the depth of the channel 25 % and by the holes' level 80 % below.  Which of the two is wrong at the front
-is not known, as the program was not run on a finer mesh; a value found there could not be scored.  Doses,
-surface charge and gates were not compared.  Oxides, tapers and widths of the channel stop are rounded to
-whole planes (0.13 um) and columns (0.6 um) of its mesh by its code."""
+the depth of the channel 25 % and by the holes' level 80 % below.  Which of the two is wrong at the
+front is not known, as the program was not run on a finer mesh; a value found there could not be scored.
+Doses, surface charge and gates were not compared.  Oxides, tapers and widths of the channel stop are
+rounded to whole planes (0.13 um) and columns (0.6 um) of its mesh by its code."""
 
 
 def changed(device: Device, change: Mapping[str, float]) -> Device:
