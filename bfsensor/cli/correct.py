@@ -79,7 +79,7 @@ class _Task:
               "campaign.yaml's masks and LSST's mask planes count without it.")  # fmt: skip
 @click.option("--variance", "read_noise", type=float, metavar="ELECTRONS",
               help="Also write the variance of each pixel, for weight maps, as further extensions "
-              "VARIANCE; the read noise [e-] is given.")  # fmt: skip
+              "VARIANCE, for files without one; the read noise [e-] is given.")  # fmt: skip
 @click.option("-o", "--output", type=click.Path(path_type=Path), required=True,
               help="File to write; with several FILES the folder for files of the same names, made "
               "if it is missing.")  # fmt: skip

@@ -364,7 +364,7 @@ def correct_file(
     precision, their overscan's level subtracted; pixels outside data sections are relative to the median
     of the overscan.  With a read noise each image has a further extension with its variance, named
     VARIANCE, or VARIANCE_ and its name or number where there are several, infinite where a pixel is
-    masked or outside data sections; LSST's exposures, which have a variance, get none.
+    masked or outside data sections.
 
     Parameters
     ----------
@@ -388,7 +388,8 @@ def correct_file(
     Raises
     ------
     RecordingError
-        The input cannot be read, see :func:`read_parts`, or the output exists or cannot be written.
+        The input cannot be read, see :func:`read_parts`, or has an extension VARIANCE of its own, as
+        LSST's exposures do, and a read noise is given; the output exists or cannot be written.
 
     Examples
     --------
@@ -478,6 +479,10 @@ def _write(
         new = fits.HDUList()
         variances = []
         names = [str(hdu.name).strip().upper() for hdu in hdus]
+        if "VARIANCE" in names and any(one.variance is not None for one in found):
+            raise RecordingError(
+                f"{path}: has an extension VARIANCE, which is kept: correct it without a read noise"
+            )
         several = len({one.layout.hdu for one in found}) > 1
         for number, hdu in enumerate(hdus):
             own = [one for one in found if one.layout.hdu == number]
@@ -494,7 +499,7 @@ def _write(
                 header[card[0]] = card[1:]
             made = fits.PrimaryHDU if number == 0 else fits.ImageHDU
             new.append(made(pixels, header))
-            if own[0].variance is not None and "VARIANCE" not in names:
+            if own[0].variance is not None:
                 name = f"VARIANCE_{names[number] or number}" if several else "VARIANCE"
                 variances.append(_variance_hdu(own, header, pixels.shape, name))
         new.extend(variances)

@@ -351,3 +351,17 @@ def test_a_read_noise_below_zero_is_refused_before_anything_is_written(tmp_path)
     result = run(path, "--table", NAME, "--variance", -1.0, "-o", out)
     assert result.exit_code == 1 and "read_noise = -1.0" in result.output
     assert not out.exists()
+
+
+def test_a_file_with_a_variance_of_its_own_gets_no_second_one(tmp_path):
+    path = tmp_path / "in.fits"
+    image = fits.PrimaryHDU(scene().astype(np.float32), fits.Header({"BUNIT": "electron"}))
+    own = fits.ImageHDU(np.ones((60, 48), np.float32), name="VARIANCE")
+    mask = fits.ImageHDU(np.zeros((60, 48), np.int32), name="MASK")
+    image.name = "IMAGE"
+    fits.HDUList([image, mask, own]).writeto(path)
+    out = tmp_path / "out.fits"
+    result = run(path, "--table", NAME, "--variance", 5.0, "-o", out)
+    assert result.exit_code == 1 and "has an extension VARIANCE" in result.output
+    assert not out.exists()
+    assert run(path, "--table", NAME, "-o", out, "--overwrite").exit_code == 0

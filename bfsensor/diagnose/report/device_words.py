@@ -44,7 +44,8 @@ class FittedQuantity:
         Value by the recordings and the priors of all other quantities, within what it can be, and its
         standard error, in the unit of device files.
     at_end : bool
-        Whether that value is an end of its range: of what the quantity can be, or FARTHEST off.
+        Whether that value is an end of its range: the largest or smallest that the quantity can have,
+        or FARTHEST uncertainties from the nominal one.
     gain : float
         Decrease of the chi-square at that value if the prior of this quantity is left out; for a
         device within its file at most a chi-square of one degree of freedom.
