@@ -409,6 +409,9 @@ class Effect:
     either order; 'rough', not smooth, so that amplitudes at starting points are kept."""
     in_images: ClassVar[bool] = True
     """Whether sensors can draw images with it; they refuse others."""
+    in_areas: ClassVar[bool] = False
+    """Whether tables of measured a_ij hold what :meth:`covariances` does: a share of the signal that
+    moves between pixels, the same at all levels and in all amplifiers."""
     scatters: ClassVar[tuple[str, ...]] = ()
     """Channels whose scatter constrains the amplitude: :meth:`modes` are proportional to it there."""
 

@@ -34,6 +34,7 @@ class ElectronicMemory(Effect):
     parameters = (Parameter("alpha", "", 1e-5, 1e-3, signed=True, amplitude=True),)
     touches = ("serial_overscan", "flat_mean", "flat_cov", "flat_map", "spot")
     maps_vary = "nothing"
+    in_areas = True
     source = (
         "Electronic offset drift of ITL sensors, here of one pixel: Snyder et al. 2021, JATIS 7, "
         "048002; range assumed"
@@ -103,6 +104,7 @@ class Settling(Effect):
     )
     touches = ("serial_overscan", "flat_mean", "flat_cov", "flat_map", "spot")
     maps_vary = "nothing"
+    in_areas = True
     source = (
         "Exponential settling of a stage of first order: Horowitz & Hill, The Art of Electronics, "
         "section 1.4; Janesick 2001, Scientific Charge-Coupled Devices, SPIE Press, section 6.2; "

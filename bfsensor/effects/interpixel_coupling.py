@@ -43,6 +43,7 @@ class InterpixelCoupling(Effect):
         Parameter("decay", "", 0.0, 0.5, law="flat", plain=0.0, ends=(0.0, 1.0)),
     )
     touches = ("flat_cov", "spot")
+    in_areas = True
     source = (
         "Four neighbours: Moore, Ninkov & Forrest 2004, Proc. SPIE 5167, 204; diagonal and farther "
         "ones: Giannini et al. 2013, Exp. Astron. 36, 1; Donlon et al. 2016; range of CCD video chains "

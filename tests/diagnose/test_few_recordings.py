@@ -189,7 +189,7 @@ def test_errors_of_far_lags_contradict_what_stated_ones_allow():
     found = diagnose_measured(measured, predicted, explain=False)
     assert found.mismatch.detected
     (said,) = (n for n in found.notes if "far lags" in n)
-    assert "all errors of the table are multiplied by 0.15" in said
+    assert "all errors of the table are multiplied by 0.14" in said
     (stated,) = (n for n in found.notes if n.startswith("with the errors as stated"))
     assert float(stated.split()[-1]) > 0.5
 

@@ -10,8 +10,9 @@ With ``--engine BINARY`` half of the cases whose changes Poisson_CCD has are its
 by 1.5, 3 and 4.5 of its uncertainties, nothing else scattered.  ``run --shared`` starts each case with
 the solutions of the nominal device that another one has made, which are the same for all.
 
-Cases: one change of a quantity, a third of them two, a fifth a change that no piece describes; sizes are
-log-uniform from 0.5 to 15 typical changes; the engines are those of :mod:`validation.silicon.truths`.
+Cases: one change of a quantity, a third of them two; a fifth a change that no piece describes; a
+seventh signal that moves between pixels after collection, which is no silicon.  Sizes are log-uniform
+from 0.5 to 15 typical changes; the engines are those of :mod:`validation.silicon.truths`.
 Projected SNR: length of the change in errors after all quantities with an uncertainty have
 adapted within their priors, linearly.
 """
@@ -44,16 +45,20 @@ from validation.common.write_results import write_results
 from validation.silicon.truths import (
     BLUR,
     DOTS,
+    ECHO,
+    GAIN,
     GATES,
     IMAGE_CHARGE,
     LEVEL,
+    MEMORY,
+    MOVED,
     POISSON_CCD,
     areas,
-    blurred,
     by_image_charges,
     by_poisson_ccd,
     changed,
     noise_matrix,
+    read_out,
 )
 
 RESULTS = Path(__file__).parents[1] / "results" / "silicon_cases.ecsv"
@@ -68,9 +73,16 @@ VOLTS = {"operating_point.back_bias": 1.0, "operating_point.gate_high": 0.3}
 SIZES, QUANTITIES, SMALL = (1.5, 3.0, 4.5), 10, 1e-3
 """Of the ladder: sizes and step of derivatives [uncertainties], and number of quantities.  Chosen: the
 sizes within and beyond what a prior allows; twice as many quantities are twice as many cases."""
-OUTSIDE = {DOTS: -2000.0, BLUR: 2e-4}
-"""Typical changes that no piece describes: dose of dots [e/um2], share of charge that moves.  Chosen
-for a projected SNR of about 2.5; of 8 cases drawn before with -100 and 2e-5 none was visible."""
+OUTSIDE = {DOTS: -10_000.0, ECHO: 3.5e-5, GAIN: 6e-4}
+"""Typical changes that no piece describes: dose of dots [e/um2], share of the signal that arrives late,
+relative error of the gain.  Chosen for a projected SNR of 2.5; that of dots is not known."""
+READOUT = {BLUR: 7e-5, MEMORY: 2.5e-4}
+"""Typical shares of the signal that move between pixels.  Chosen for the same projected SNR."""
+CLASSES = {
+    BLUR: "interpixel_coupling", MEMORY: "electronic_memory",
+    **dict.fromkeys(OUTSIDE, "outside_library"),
+}  # fmt: skip
+"""Class of report.json of changes that are no quantity of a device."""
 
 
 def draw_case(
@@ -86,22 +98,28 @@ def draw_case(
     }
     if null:
         return {"scatter": scatter, "change": {}, "engine": "poisson", "outside": False}
-    outside = rng.random() < 0.2
-    typical = dict(OUTSIDE) if outside else {**known, **VOLTS, GATES: 1.0}
+    outside, moved = rng.random(2) < (1 / 5, 1 / 6)
+    special = OUTSIDE if outside else READOUT if moved else {}
+    typical = dict(special) or {**known, **VOLTS, GATES: 1.0}
     engine = "poisson"
-    if not outside and other != "poisson" and rng.random() < 0.5:
+    if not special and other != "poisson" and rng.random() < 0.5:
         engine = other
         typical = {k: v for k, v in typical.items() if engine_has(engine, k)}
-    number = 2 if not outside and rng.random() < 1 / 3 else 1
+    number = 2 if not special and rng.random() < 1 / 3 else 1
     names = rng.choice(sorted(typical), size=number, replace=False)
     change = {}
     for name in names:
         size = np.exp(rng.uniform(np.log(SMALLEST), np.log(LARGEST)))
-        sign = 1.0 if name in OUTSIDE else rng.choice([-1.0, 1.0])
+        sign = 1.0 if name in CLASSES else rng.choice([-1.0, 1.0])
         change[str(name)] = float(sign * size * typical[name])
         if name == GATES:
             change[GATES] = float(rng.choice([-1.0, 1.0]))
-    return {"scatter": scatter, "change": change, "engine": engine, "outside": outside}
+    return {
+        "scatter": scatter,
+        "change": change,
+        "engine": engine,
+        "outside": bool(outside),
+    }
 
 
 def engine_has(engine: str, quantity: str) -> bool:
@@ -140,10 +158,10 @@ def tables_of(
                 a * by_image_charges(here, case["change"], w)
                 for a, w in zip(before, WAVELENGTHS, strict=True)
             ]
-        elif case["change"]:
+        elif case["change"].keys() - {GAIN, *MOVED}:
             after = areas(changed(here, case["change"]), WAVELENGTHS)
-            if BLUR in case["change"]:
-                after = [blurred(a, case["change"][BLUR]) for a in after]
+        for name in case["change"].keys() & {GAIN, *MOVED}:
+            after = [read_out(a, name, case["change"][name]) for a in after]
         plain += before
         full += after
     return plain, full
@@ -468,8 +486,8 @@ def class_of(name: str) -> str:
         "surface_charge",
         "collecting_phases",
     )
-    if name in OUTSIDE:
-        return "outside_library"
+    if name in CLASSES:
+        return CLASSES[name]
     return "silicon_physics" if name.endswith(silicon) else "device_parameter"
 
 

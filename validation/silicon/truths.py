@@ -40,9 +40,19 @@ PAIRS, PIXELS = 300, 2048**2
 """Pairs of flats of a table, and pixels of each.  Chosen: what a laboratory takes in a day."""
 CELLS = 64
 """Cells of the truths' mesh a pixel."""
-GATES, DOTS, BLUR = "gates.collecting_phases", "dots", "blur"
-"""Changes that are no quantity of a device file: gates; dots of implants in the channel stops, and
-charge that moves to neighbours after collection, neither of which a piece of the diagnosis describes."""
+GATES = "gates.collecting_phases"
+"""Number of gates, a change that is no quantity of a device file's uncertainties."""
+BLUR, MEMORY = "coupling", "memory"
+"""Signal that moves after collection: to the four neighbours; to the pixel that is read next."""
+DOTS, ECHO, GAIN = "dots", "echo", "gain"
+"""Changes that no effect or piece of the diagnosis describes: dots of implants in the channel stops; a
+reflected signal that arrives :data:`LATE` pixels late; a gain that is wrong, and with it a_00."""
+LATE = 3
+"""Delay of a reflected signal [pixel].  Chosen: two are within the reach of a settling amplifier."""
+MOVED = {
+    BLUR: ((0, 1), (0, -1), (1, 0), (-1, 0)), MEMORY: ((0, 1),), ECHO: ((0, LATE),),
+}  # fmt: skip
+"""Places (y, x) to which each moves a share of a pixel's signal."""
 IMAGE_CHARGE = {
     "silicon.thickness": "thickness",
     "silicon.background_doping": "doping",
@@ -77,7 +87,7 @@ def changed(device: Device, change: Mapping[str, float]) -> Device:
             )  # fmt: skip
             stop = dataclasses.replace(device.channel_stop, dots=dots)
             device = dataclasses.replace(device, channel_stop=stop)
-        elif name != BLUR:
+        elif name not in (*MOVED, GAIN):
             device = change_parameter(device, name, by)
     return device
 
@@ -145,23 +155,29 @@ def by_poisson_ccd(
     return before, [a * ratio * back / back_after for a in after]
 
 
-def blurred(a: Array, share: float) -> Array:
-    """a_ij after a share of the charge of each pixel has moved to each of its four neighbours.
+def read_out(a: Array, name: str, share: float) -> Array:
+    """a_ij as measured when a share of each signal moves, or the gain is too large by a share.
 
-    The white part of the variance, 1 / level, is in the a_ij that are measured as C / level^2.
+    The white part of the variance, 1 / level, is in the covariances C / level^2, and moves too.
+    What remains of it at lag (0, 0) grows with the level as the photon noise does: a gain measured on
+    photon transfer curves takes it as that noise, and a_00 does not hold it.
     """
+    if name == GAIN:
+        out = a.copy()
+        out[0, 0] += 1 / LEVEL - 1 / (LEVEL * (1 + share))
+        return out
     side = 4 * LAGS
     wide = np.zeros((side, side))
     at = np.arange(-LAGS + 1, LAGS)
     wide[np.ix_(at, at)] = a[np.ix_(abs(at), abs(at))]
     wide[0, 0] += 1 / LEVEL
     kernel = np.zeros((side, side))
-    kernel[0, 0] = 1 - 4 * share
-    for place in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+    kernel[0, 0] = 1 - len(MOVED[name]) * share
+    for place in MOVED[name]:
         kernel[place] = share
     power = np.fft.fft2(wide) * abs(np.fft.fft2(kernel)) ** 2
     out = np.fft.ifft2(power).real
-    out[0, 0] -= 1 / LEVEL
+    out[0, 0] -= (kernel**2).sum() / LEVEL
     return out[:LAGS, :LAGS]
 
 

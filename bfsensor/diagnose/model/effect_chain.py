@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.data.ptc_turnoff import find_turn_off
 from bfsensor.diagnose.kinds import KINDS
 from bfsensor.diagnose.model.baseline import Baseline, level_areas
+from bfsensor.diagnose.model.flat_predictions import periodic_covariances, quadrant
 from bfsensor.diagnose.model.map_predictions import MapChange, shot_at
 from bfsensor.effects.effect import STAGES, Axes, Effect, Halo, Law, Layout, Shot
 from bfsensor.files import Cache
@@ -184,6 +186,39 @@ class EffectChain:
                 c = c * (((up - down) / (2 * step)) ** 2)[:, None, None]
             c = effect.covariances(c, axes, self.layout)
         return c
+
+    def area_readout(self, a: FloatArray, level: float, axes: Axes) -> FloatArray | None:
+        """Change of measured a_ij by charge or signal that moves between pixels [1/e-].
+
+        Measured a_ij are covariances over the square of the level.  The change of the variance in
+        proportion to the level is not in a_00, as a gain measured on photon transfer curves holds it.
+
+        Parameters
+        ----------
+        a : ndarray, odd sides
+            Area changes [1/e-] before the readout.
+        level : float
+            Level of the flats [e-].
+        axes : mapping
+            Axes of one flat, arrays of shape (1,), as in :meth:`covariances`.
+
+        Returns
+        -------
+        change : ndarray or None
+            Lags from 0; None if there is no such effect, or at level 0, which is a limit.
+        """
+        own = copy(self)
+        own.effects = tuple(e for e in self.effects if e.in_areas)
+        if not own.effects or level <= 0:
+            return None
+        both = np.array([a, np.zeros_like(a)])
+        c = periodic_covariances(both, [level, level])
+        twice = {k: np.repeat(v, 2) for k, v in axes.items()} | {"level": np.full(2, level)}
+        read = own.covariances(c, twice)
+        signal = own.signal(twice["level"], twice)[0]
+        change = read[0] / signal**2 - c[0] / level**2
+        change[0, 0] -= read[1, 0, 0] / signal**2 - c[1, 0, 0] / level**2
+        return quadrant(change[None], a.shape[-1] // 2)[0]
 
     def added(
         self, channel: Channel, gains: FloatArray, axes: dict[str, NDArray]

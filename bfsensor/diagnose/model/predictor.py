@@ -62,6 +62,11 @@ class _AtPoint:
                     out[own] = 0.5 * (
                         a[y + j[own], x0 + i[own]] + a[y - j[own], x0 + i[own]]
                     )
+                    if chain is not None:
+                        one = {k: v[own[:1]] for k, v in x.items()}
+                        read = chain.area_readout(a, float(level), one)
+                        if read is not None:
+                            out[own] += read[j[own], i[own]]
                 continue
             pairs = np.stack([amp[rows], x["level"][rows]], axis=1)
             groups, first, index = np.unique(

@@ -74,8 +74,11 @@ def test_errors_are_those_of_the_far_lags(stated):
     (channel,) = scaled.channels
     far = np.hypot(channel.axes["i"], channel.axes["j"]) > FAR
     left = channel.values - areas_at()[channel.axes["j"], channel.axes["i"]]
-    rms = np.sqrt(np.mean((left[far] / (stated * ERROR)) ** 2))
-    n = int(far.sum())
+    square = (channel.axes["i"] ** 2 + channel.axes["j"] ** 2)[far].astype(float)
+    n = int(far.sum()) - 2
+    smooth = np.linalg.qr(np.array([1 / square, 1 / square**2]).T)[0]
+    rough = left[far] - smooth @ (smooth.T @ left[far])
+    rms = np.sqrt(np.sum((rough / (stated * ERROR)) ** 2) / n)
     ends = [rms * np.sqrt(n / chi2.ppf(q, n)) for q in (0.975, 0.025)]
     expected = 1.0 if ends[0] < 1 < ends[1] else ends[1]
     assert (expected == 1.0) == (stated == 1.0)
@@ -83,13 +86,33 @@ def test_errors_are_those_of_the_far_lags(stated):
     assert any("17 far lags" in note for note in scaled.notes)
 
 
-def test_far_lags_without_any_scatter_scale_nothing():
-    """A table whose far lags are written as 0 beside a baseline that predicts 0 there."""
+@pytest.mark.parametrize("effect", [
+    BrighterFatterLongRange({"amp": 2e-8, "power": 2.0}),
+    BrighterFatterLongRange({"amp": -1e-7, "power": 3.5}),
+], ids=["slow", "steep"])  # fmt: skip
+def test_a_response_that_reaches_farther_is_no_noise(effect):
+    """Far lags that are off by several errors, smoothly, leave the errors as they are."""
+    measured = measure_reduced(table_of(areas_at(), 6, error=3e-10), reach=4)
+    predictor, _ = fit_bounded(measured, fixed())
+    (channel,) = measured.channels
+    more = predictor.with_effects((effect,), predictor.start)
+    tail = more.predict(channel, more.start) - predictor.predict(channel, predictor.start)
+    far = np.hypot(channel.axes["i"], channel.axes["j"]) > FAR
+    assert np.sqrt(np.mean(tail[far] ** 2)) > 2 * 3e-10
+    drawn = replace(measured, channels=(replace(channel, values=channel.values + tail),))
+    for which in (measured, drawn):
+        (scaled,) = scale_errors(which, fixed()).channels
+        np.testing.assert_allclose(scaled.errors, 3e-10)
+
+
+@pytest.mark.parametrize("baseline", [fixed(), free_baseline()], ids=["a table", "none"])
+def test_far_lags_without_any_scatter_scale_nothing(baseline):
+    """A table whose far lags are written as 0, whatever the baseline predicts there."""
     table = table_of(areas_at(), 4)
     j, i = np.indices(table.a.shape)
     a = np.where(np.hypot(i, j) > FAR, 0.0, table.a)
     measured = measure_reduced(replace(table, a=a), reach=4)
-    (channel,) = scale_errors(measured, free_baseline()).channels
+    (channel,) = scale_errors(measured, baseline).channels
     assert np.all(channel.errors == ERROR)
 
 
