@@ -1,7 +1,8 @@
 """The a_ij of one device as fit, diagnosis, sweep and exported table give them, by colour of the light.
 
 ``python -m validation.boundaries.one_response`` solves two devices on 16 cells a pixel at 40,000 e- for
-each who asks, and a_00 in two bands, LSST's y and u as boxes of 970 to 1060 and 340 to 390 nm.
+each who asks, and a_00 in two bands, LSST's y and u as boxes of 970 to 1060 and 340 to 390 nm: of the
+devices and, with the same light, of image charges by numpy, the kind of model behind Rubin's figure.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ from bfsensor.table.quadrant_shifts import quadrant_shifts
 from bfsensor.table.table_plan import plan_table
 from bfsensor.typing import FloatArray
 from validation.common.write_results import RESULTS, write_results
+from validation.concealed.card import NOMINAL
+from validation.concealed.electrostatics import edge_shifts
 
 DEVICES = ("itl_sta3800c", "e2v_ccd250")
 
@@ -70,16 +73,20 @@ def asked(device: Device) -> dict[str, Callable[[float | None], FloatArray]]:
     }
 
 
-def in_band(device: Device, low: float, high: float) -> float:
-    """a_00 [1/e-] in a band, weighted with the light that converts."""
-    found = solve_response(device, cells=CELLS)
-    a = area_matrix(found.kx, found.ky)[:, REACH + 1, REACH + 1]
+def in_band(
+    a: Callable[[float], float], thickness: float, low: float, high: float
+) -> float:
+    """a_00 [1/e-] in a band from that at a wavelength [nm], weighted with the light that converts."""
     waves = np.linspace(low, high, 31)
-    converts = -np.expm1(
-        -device.silicon.thickness / np.asarray(absorption_length(waves, KELVIN), float)
-    )
-    means = [conversion_weights(found.depths, w, KELVIN) @ a for w in waves]
-    return float(converts @ means / converts.sum())
+    converts = -np.expm1(-thickness / np.asarray(absorption_length(waves, KELVIN), float))
+    return float(converts @ [a(w) for w in waves] / converts.sum())
+
+
+def by_image_charges(wavelength: float) -> float:
+    """a_00 [1/e-] of image charges between two planes, the device of :mod:`validation.concealed`."""
+    length = float(absorption_length(wavelength, KELVIN))
+    kx, ky = map(np.asarray, edge_shifts(NOMINAL, length, NOMINAL["vbb"])[:2])
+    return float(area_matrix(kx, ky)[len(kx) // 2, len(ky) // 2])
 
 
 def rows_of(name: str) -> list[dict[str, Any]]:
@@ -97,19 +104,34 @@ def rows_of(name: str) -> list[dict[str, Any]]:
                     "who": word, "i": i, "j": j, "a_per_e": value,
                     "over_fit": value / float(wanted[j, i]),
                 })  # fmt: skip
-    y, u = (in_band(device, *band) for band in BANDS.values())
-    rows.append({
-        "device": name, "light": "y over u", "who": "fit", "i": 0, "j": 0, "a_per_e": y,
-        "over_fit": y / u,
-    })  # fmt: skip
+    found = solve_response(device, cells=CELLS)
+    a = area_matrix(found.kx, found.ky)[:, REACH + 1, REACH + 1]
+
+    def in_light(wavelength: float) -> float:
+        return float(conversion_weights(found.depths, wavelength, KELVIN) @ a)
+
+    rows.append(_of_bands(name, "fit", in_light, device.silicon.thickness))
     return rows
+
+
+def _of_bands(
+    name: str, who: str, a: Callable[[float], float], thickness: float
+) -> dict[str, Any]:
+    """Row of a_00 in y, and over that in u."""
+    y, u = (in_band(a, thickness, *band) for band in BANDS.values())
+    return {
+        "device": name, "light": "y over u", "who": who, "i": 0, "j": 0, "a_per_e": y,
+        "over_fit": y / u,
+    }  # fmt: skip
 
 
 def main() -> None:
     """Solve, print and write the rows."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.parse_args()
-    table = Table([row for name in DEVICES for row in rows_of(name)])
+    rows = [row for name in DEVICES for row in rows_of(name)]
+    rows.append(_of_bands("image charges", "numpy", by_image_charges, NOMINAL["thickness"]))
+    table = Table(rows)
     table["a_per_e"].info.format = ".5e"
     table["over_fit"].info.format = ".5f"
     table.pprint(max_lines=-1, max_width=-1)

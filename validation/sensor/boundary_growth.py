@@ -23,6 +23,7 @@ from bfsensor.direct.spot_exposure import SpotPlan
 from bfsensor.measure.growth import measure_growth
 from bfsensor.response.vertices import vertex_fractions
 from bfsensor.sensor.charge_response import factor_table
+from bfsensor.sensor.drift_field import solve_drift
 from bfsensor.simulate.boundaries import find_boundaries
 from bfsensor.simulate.mesh import make_mesh
 from bfsensor.simulate.poisson import Electrostatics
@@ -37,8 +38,8 @@ CELLS = (8, 16, 24, 32)
 REACH, HALF, PERIOD, VERTICES = 4, 6, 14, 32
 """Largest distance of edges that move, half of the stamp, period of the array [pixel], and vertices of
 an edge.  Chosen: beyond 4 pixels there is 1e-4 of the light."""
-DIFFUSION = 4.5
-"""Width of the diffusion from the back surface [um].  Measured (``silicon_pieces.ecsv``)."""
+WELL = 2.0
+"""Height below which electrons do not diffuse out of the wells [um], as in the sensor."""
 
 
 class Light:
@@ -129,14 +130,16 @@ def by_table(
 def main(name: str) -> None:
     """Make all rows."""
     device = Device.load(name)
+    drift = solve_drift(device.to_toml(), device.operating_point.temperature, WELL)
     nodes, weights = np.polynomial.legendre.leggauss(4)
     moments, parts = 0.5 * (nodes + 1), 0.5 * weights
     rows = []
     for level in LEVELS:
         plan = SpotPlan(device, peak=level)
-        sigma = float(np.hypot(plan.sigma, DIFFUSION)) / device.pixel.pitch_x
-        light = Light(plan.electrons, sigma)
         depth = plan.conversion_height
+        variance = device.diffusion**2 * np.interp(depth, drift.heights, drift.variance)
+        sigma = float(np.sqrt(plan.sigma**2 + variance)) / device.pixel.pitch_x
+        light = Light(plan.electrons, sigma)
         found = {
             f"{n} cells": by_boundaries(device, light, depth, n, moments, parts)
             for n in CELLS
