@@ -139,6 +139,12 @@ def tables_of(
     ``binary`` is Poisson_CCD, for cases of that engine, and ``known`` what it has solved.
     """
     plain, full = [], []
+    allowed = quantities(device)
+    for name in case["change"].keys() & allowed.keys():
+        moved = case["change"][name] + case["scatter"].get(name, 0.0)
+        value = parameter_value(device, name) + moved
+        if not allowed[name].low <= value <= allowed[name].high:
+            raise ValueError(f"{name} = {value:g} is beyond what device files allow")
     own = device.operating_point.back_bias
     for bias in biases:
         here = change_parameter(device, "operating_point.back_bias", bias - own)

@@ -117,13 +117,19 @@ def fitted_quantities(fit: BaselineFit, baseline: Baseline) -> list[FittedQuanti
         q = FittedQuantity(
             name=name, value=nominal + pull * width, error=error * width, nominal=nominal,
             unit=baseline.units.get(name, ""), pull=pull, pull_error=error,
-            alone=nominal + alone * width, alone_error=scatter * width,
+            alone=_added(nominal, alone * width), alone_error=scatter * width,
             at_end=bool(alone != middle), gain=gain,
             p_value=min(1.0, len(pulls) * float(chi2.sf(gain, 1))),
             odds=float(inside / (high - low) / max(within, 1e-300)),
         )  # fmt: skip
         out.append(q)
     return sorted(out, key=lambda q: -q.gain)
+
+
+def _added(nominal: float, change: float) -> float:
+    """Changed value; 0, and not its round-off, where the change is all of it."""
+    value = nominal + change
+    return 0.0 if abs(value) < 1e-12 * abs(nominal) else value
 
 
 def said_farthest(found: Sequence[FittedQuantity]) -> str:

@@ -110,3 +110,16 @@ def test_quantities_that_are_not_separated_are_named(baseline):
     said = said_farthest(fitted_quantities(fit, predictor.baseline))
     first, other = said.split("in its place: ")
     assert {n for n in NAMES[:2] if n in first} | {other.strip(".")} == set(NAMES[:2])
+
+
+def test_a_quantity_at_an_end_of_0_is_0(baseline):
+    """Not the round-off of its nominal value less all of it."""
+    name = NAMES[0]
+    whole = replace(
+        baseline, nominal={**baseline.nominal, name: 1.8}, bounds={**baseline.bounds, name: (-1.8, 1.0)},
+        spread={**baseline.spread, name: 0.3},
+    )  # fmt: skip
+    measured = measure_reduced(table((-2.5, 0.0, 0.0)), reach=baseline.reach)
+    predictor, fit = fit_bounded(measured, whole)
+    (found,) = (q for q in fitted_quantities(fit, predictor.baseline) if q.name == name)
+    assert found.at_end and found.alone == 0.0
