@@ -8,11 +8,11 @@ from typing import Any
 import click
 
 # Measured CPU seconds with an empty cache, on the machine of the notice in bfsensor._kernels.notice:
-# images 17, areas 9, tables 5 of their own and a table of 4.
-_IMAGES, _AREAS, _TABLES = 17, 9, 9
+# images 17 and corrections 3, areas 9, tables 5 of their own and a table of 4.
+_IMAGES, _AREAS, _TABLES = 20, 9, 9
 
 
-@click.command("warm", short_help="Compile the kernels of the sensors.")
+@click.command("warm", short_help="Compile the kernels of sensors and corrections.")
 @click.option("--areas", is_flag=True,
               help="Also compile the kernels of calculate_pixel_areas, about "
               f"{_AREAS} CPU s.")  # fmt: skip
@@ -20,7 +20,7 @@ _IMAGES, _AREAS, _TABLES = 17, 9, 9
               help=f"Also compile the kernels of 'bfsensor table', about {_TABLES} CPU s.")  # fmt: skip
 @click.option("--all", "everything", is_flag=True, help="All of these.")
 def warm(areas: bool, tables: bool, everything: bool) -> None:
-    """Compile the kernels of the sensors now, so that the first image does not wait.
+    """Compile the kernels of sensors and corrections now, so that the first image does not wait.
 
     Without this command kernels are compiled on first use.  Compiled kernels are kept on disk, for
     this processor and version, in the folder that is printed (the environment variable
@@ -44,6 +44,7 @@ def warm(areas: bool, tables: bool, everything: bool) -> None:
     began = time.perf_counter()
     with event.install_recorder("numba:compile") as recorder:
         _use_sensors(areas=areas)
+        _use_corrections()
         if tables:
             _use_tables()
     kernels = {
@@ -76,6 +77,16 @@ def _use_sensors(*, areas: bool) -> None:
             sensor.accumulate(photons, image)
             if areas:
                 sensor.calculate_pixel_areas(image)
+
+
+def _use_corrections() -> None:
+    """Correct a small image with a masked pixel."""
+    import numpy as np
+
+    from bfsensor.sensor.table_correction import correct_table
+
+    image = np.full((40, 40), 1e3, np.float32)
+    correct_table(image, "itl_sta3800c", mask=np.eye(40) == 1.0)
 
 
 def _use_tables() -> None:

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 from numba.core import event
 
-from bfsensor import BrighterFatterSensor, SiliconSensor
+from bfsensor import BrighterFatterSensor, SiliconSensor, correct_table
 from bfsensor._kernels import notice
 from bfsensor.cli.main import main
 
@@ -64,6 +64,10 @@ def test_what_warm_compiled_is_not_compiled_again():
                 rng=galsim.BaseDeviate(5114),
             )  # fmt: skip
             sensor.calculate_pixel_areas(image)
+        mask = image.array > image.array.max() / 2
+        for kind in (np.float32, np.float64, np.int32):
+            correct_table(image.array.astype(kind), "e2v_ccd250", mask=mask)
+            correct_table(image.array.astype(kind), "e2v_ccd250", charge_response=False)
     assert recorder.buffer == []
 
 
