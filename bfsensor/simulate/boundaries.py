@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bfsensor._kernels import drift, line_sides
-from bfsensor.errors import ConvergenceError, TableError
+from bfsensor.device.depletion import find_depletion
+from bfsensor.errors import ConvergenceError, DeviceError, TableError
 from bfsensor.simulate import row_sheets
 from bfsensor.simulate.field import Field, PathSteps
 from bfsensor.simulate.line_points import LinePoints, line_points
@@ -365,6 +366,8 @@ def find_boundaries(
     TableError
         A depth lies outside the silicon, depths do not ascend, the domain is too small for
         ``reach``, or the mirror planes do not pass through the centre of pixel (0, 0).
+    DeviceError
+        The silicon is not depleted up to its back surface.
     ConvergenceError
         A boundary was not found, because a well no longer holds its charge.
 
@@ -433,6 +436,14 @@ def _split_height(potential: Potential, surfaces: Surfaces) -> float:
     split = max(surfaces.silicon_channel, surfaces.silicon_stop) + SPLIT_HEIGHT
     z = potential.mesh.z
     rises = np.diff(potential.phi, axis=0).max(axis=(1, 2)) >= 0
+    if rises[-1]:
+        device = potential.device
+        need = find_depletion(device).full_depletion_voltage
+        raise DeviceError(
+            f"{device.name}: back_bias = {device.operating_point.back_bias:g} V does not deplete the "
+            f"silicon up to its back surface, which takes about {need:.3g} V (lower the back bias, the "
+            "background doping or the thickness)"
+        )
     ridge = float(z[np.flatnonzero(rises)[-1] + 1])
     above = int(np.searchsorted(z, split))
     mean, gap = potential.phi[above].mean() - potential.phi[-1].mean(), z[-1] - z[above]

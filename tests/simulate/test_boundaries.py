@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bfsensor.device.device import Device
-from bfsensor.errors import ConvergenceError, TableError
+from bfsensor.errors import ConvergenceError, DeviceError, TableError
 from bfsensor.response.vertices import vertex_fractions
 from bfsensor.simulate import boundaries
 from bfsensor.simulate.boundaries import find_boundaries, lowest_depth
@@ -255,3 +255,18 @@ def test_a_sheet_that_is_not_found_is_no_matter(solution, monkeypatch):
     monkeypatch.setattr(boundaries.row_sheets, "ABOVE_SADDLE", 100.0)
     found = find_boundaries(solution, [3.0, 95.0], reach=1)
     np.testing.assert_allclose(found.rows, expected.rows, atol=3e-4)
+
+
+def test_silicon_that_is_not_depleted_at_its_back_is_refused_at_once():
+    """At 1 V less than full depletion takes: paths through silicon without a field take minutes."""
+    device = Device.load("itl_sta3800c")
+    for bias, refused in ((-13.0, True), (-15.5, False)):
+        point = dataclasses.replace(device.operating_point, back_bias=bias)
+        unit = solve_unit_cell(
+            dataclasses.replace(device, operating_point=point), 0.0, cells=8
+        )
+        if refused:
+            with pytest.raises(DeviceError, match="back_bias = -13 V does not deplete"):
+                find_boundaries(unit, [50.0], reach=0)
+        else:
+            assert find_boundaries(unit, [50.0], reach=0).depths == 50.0
