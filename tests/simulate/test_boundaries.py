@@ -257,16 +257,14 @@ def test_a_sheet_that_is_not_found_is_no_matter(solution, monkeypatch):
     np.testing.assert_allclose(found.rows, expected.rows, atol=3e-4)
 
 
-def test_silicon_that_is_not_depleted_at_its_back_is_refused_at_once():
+def test_silicon_that_is_not_depleted_at_its_back_is_refused_at_once(device):
     """At 1 V less than full depletion takes: paths through silicon without a field take minutes."""
-    device = Device.load("itl_sta3800c")
     for bias, refused in ((-13.0, True), (-15.5, False)):
         point = dataclasses.replace(device.operating_point, back_bias=bias)
-        unit = solve_unit_cell(
-            dataclasses.replace(device, operating_point=point), 0.0, cells=8
-        )
+        other = dataclasses.replace(device, operating_point=point)
+        array = solve(other, 6, 8, {})
         if refused:
             with pytest.raises(DeviceError, match="back_bias = -13 V does not deplete"):
-                find_boundaries(unit, [50.0], reach=0)
+                find_boundaries(array, [50.0], reach=1)
         else:
-            assert find_boundaries(unit, [50.0], reach=0).depths == 50.0
+            assert find_boundaries(array, [50.0], reach=1).depths == 50.0
