@@ -366,10 +366,9 @@ def _check_beyond(
         count += int(np.count_nonzero(out if bad is None else out & ~bad[rows]))
     if not count:
         return
-    text = (
-        f"{count} pixels hold more charge than the table, which ends at {most:.0f} e-, or have more "
-        f"around them than its last background, {most_around:.0f} e-"
-    )
+    text = f"{count} pixels hold more charge than the table, which ends at {most:.0f} e-"
+    if background:
+        text += f", or have more around them than its last background, {most_around:.0f} e-"
     if beyond == "error":
         raise SensorError(f"{text}: mask them, or take a table with higher charges")
     warnings.warn(

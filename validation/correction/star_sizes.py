@@ -7,6 +7,7 @@ take
     20,000 e-, in u, r and y, from the same photons with and without the effect; one more star stands
     beside a saturated one, whose charge bled and is masked.  Adaptive moments before and after each
     correction, a row a star in ``validation/results/star_sizes.ecsv``.  Rows that are there are kept.
+    ``--device hsc_hamamatsu`` is a sensor of image charges in place of Poisson's equation.
 show
     Print what is left of the slope of size against peak, of the ellipticity, and of biases of shear.
 """
@@ -82,7 +83,9 @@ def corrections(device: str) -> dict[str, Callable[..., NDArray]]:
     """Give the corrections by name; each takes an image, a mask and a band."""
     table = table_of(device)
     empty = quadrant_shifts(table, tail_slope=None)
-    level = quadrant_shifts(table, background=50e3, tail_slope=None)
+    # Tables of image charges have one background, on which nothing depends.
+    highest = min(50e3, float(table.backgrounds[-1]))
+    level = quadrant_shifts(table, background=highest, tail_slope=None)
     kernel, kernel_level = solve_kernel(empty.areas), solve_kernel(level.areas)
 
     def own(image: NDArray, mask: NDArray, band: str) -> NDArray:
@@ -182,10 +185,10 @@ def star_row(
     return row
 
 
-def cases(count: int) -> Iterator[dict[str, object]]:
+def cases(count: int, devices: tuple[str, ...] = DEVICES) -> Iterator[dict[str, object]]:
     """Give the keys of all rows, one star of each kind before the second."""
     for seed in range(9101, 9101 + count):
-        for device, width in itertools.product(DEVICES, WIDTHS):
+        for device, width in itertools.product(devices, WIDTHS):
             for sky, band in itertools.product(SKIES, BANDS):
                 peaks = (*PEAKS, NEIGHBOUR) if (sky, band) == (1e3, "r") else PEAKS
                 for peak in peaks:
@@ -193,13 +196,16 @@ def cases(count: int) -> Iterator[dict[str, object]]:
                            "band": band, "seed": seed}  # fmt: skip
 
 
-def take(path: Path, count: int, skies: tuple[float, ...] = SKIES) -> None:
+def take(
+    path: Path, count: int, skies: tuple[float, ...] = SKIES,
+    devices: tuple[str, ...] = DEVICES,
+) -> None:  # fmt: skip
     """Make the rows that are not there, in some of the skies."""
     old = Table.read(path, format="ascii.ecsv") if path.exists() else None
     names = ("device", "width", "peak", "sky", "band", "seed")
     there = set() if old is None else {tuple(row[n] for n in names) for row in old}
     made: list[dict] = []
-    for key in cases(count):
+    for key in cases(count, devices):
         if key["sky"] not in skies or tuple(key[n] for n in names) in there:
             continue
         made.append(star_row(**key))
@@ -284,11 +290,11 @@ def select(rows: Table, **given: object) -> Table:
     return rows[keep]
 
 
-def show(path: Path) -> None:
+def show(path: Path, devices: tuple[str, ...] = DEVICES) -> None:
     """Print what is left, by device, width, sky and band."""
     rows = Table.read(path, format="ascii.ecsv")
-    names = list(corrections(DEVICES[0]))[1:]
-    for device, width in itertools.product(DEVICES, WIDTHS):
+    names = list(corrections(devices[0]))[1:]
+    for device, width in itertools.product(devices, WIDTHS):
         for sky, band in itertools.product(SKIES, BANDS):
             part = select(rows, device=device, width=width, sky=sky, band=band)
             if len(slopes(part, "none", "x")) < 2:
@@ -320,14 +326,19 @@ def show(path: Path) -> None:
 @click.argument("what", type=click.Choice(["take", "show"]))
 @click.option("--count", default=8, help="Stars of each kind.")
 @click.option("--sky", type=float, multiple=True, help="Skies [e-], by default all.")
+@click.option(
+    "--device", multiple=True, help="Devices, by default two of Poisson's equation."
+)
 @click.option("--folder", default=str(RESULTS))
-def main(what: str, count: int, sky: tuple[float, ...], folder: str) -> None:
+def main(
+    what: str, count: int, sky: tuple[float, ...], device: tuple[str, ...], folder: str
+) -> None:
     """Take rows, or print what they say."""
     path = Path(folder) / STARS.name
     if what == "take":
-        take(path, count, sky or SKIES)
+        take(path, count, sky or SKIES, device or DEVICES)
     else:
-        show(path)
+        show(path, device or DEVICES)
 
 
 if __name__ == "__main__":
