@@ -24,9 +24,10 @@ def explain_single_value(
 ) -> Attribution | None:
     """Describe a mismatch that one value of a table causes alone.
 
-    The value with the largest residual is left out.  If nothing stands out without it, and no
-    effect of the library explains the others better than noise does, then no physics has been
-    seen: one value differs from the baseline.  Effects that would explain it, such as area that
+    The value whose change explains most is left out: that of one table, or of a lag in all tables, as a
+    gain that is wrong for all acts on a_00 alone.  If nothing stands out without it, and no effect of
+    the library explains the others better than noise does, then no physics has been seen: one value
+    differs from the baseline.  Effects that would explain it, such as area that
     is gained beyond the table's lags where a_00 is too negative, are listed.
 
     Parameters
@@ -48,24 +49,25 @@ def explain_single_value(
     """
     if any(c.unit != PER_ELECTRON for c in fit.channels) or len(fit.channels) != 1:
         return None
+    model = Model(predictor, fit)
+    family = lag_family(Scene(model))
+    assert family is not None and family.group == SINGLE
+    best = Dictionary(family, fit).choose()
+    if best is None:
+        return None
+    own = best.terms[0]
     channel = fit.channels[0]
-    row = _farthest(fit)
-    others = np.arange(len(channel)) != row
-    kept = channel.take(others)
+    kept = channel.take(~np.isin(np.arange(len(channel)), own.where["rows"]))
     without = fit_baseline(predictor, [kept])
     left = locate_mismatch(without, seed=seed)
     if left.detected or _any_effect(Model(predictor, without), left):
         return None
-    model = Model(predictor, fit)
-    family = lag_family(Scene(model))
-    assert family is not None and family.group == SINGLE
-    own = [t for t in family.terms if t.where["row"] == row]
     choice = Dictionary(
-        Family(SINGLE, tuple(own), family.words, tried=len(family.terms)), fit
+        Family(SINGLE, (own,), family.words, tried=len(family.terms)), fit
     ).choose()
     if choice is None:
         return None
-    after = model.with_columns(Columns(own[:1]))
+    after = model.with_columns(Columns([own]))
     free = FreeFit(
         after, (choice,), {SINGLE: choice.score}, locate_mismatch(after.fit, seed=seed)
     )
@@ -96,13 +98,6 @@ def explain_single_value(
         notes=tuple(notes),
         free_form=world,
     )
-
-
-def _farthest(fit: BaselineFit) -> int:
-    """Index of the value with the largest residual over its own error."""
-    n = len(fit.residuals)
-    own = np.maximum(1 - (fit.basis[:n] ** 2).sum(1), 1e-6)
-    return int(np.argmax(np.abs(fit.residuals) / np.sqrt(own)))
 
 
 def _any_effect(model: Model, mismatch: Mismatch) -> bool:

@@ -24,6 +24,7 @@ SCALE = 1e5
 """Signal [e-] at which coefficients of its powers are given.  Defined: the unit in report.json."""
 
 SINGLE = "single values"
+ALL_TABLES = "all tables"
 """Group of terms that change one measured a_ij each."""
 
 AREA_UNIT = 1e-8
@@ -220,24 +221,35 @@ def _at_lag(
 
 
 def _single_values(channels: list[Channel]) -> Family:
-    """Family of changes of one measured a_ij each, by the index of its row; unit 1e-8 / e-."""
-    terms = tuple(
-        Term(
-            f"a_{int(c.axes['i'][row])}{int(c.axes['j'][row])} of table {int(c.axes['table'][row]) + 1}",
-            {"lags": [(int(c.axes["i"][row]), int(c.axes["j"][row]))], "row": row,
-             "relative": AREA_UNIT / c.values[row], "table": int(c.axes["table"][row])},
-            partial(_of_row, c, row),
-        )
-        for c in channels for row in range(len(c))
-    )  # fmt: skip
-    return Family(SINGLE, terms, ("flat_cov",))
+    """Family of changes of one measured a_ij, of a table or of all alike; unit 1e-8 / e-."""
+    terms = []
+    for c in channels:
+        lags = list(zip(c.axes["i"].tolist(), c.axes["j"].tolist(), strict=True))
+        groups: list[tuple[tuple[int, ...], str]] = [
+            ((row,), f"table {int(c.axes['table'][row]) + 1}") for row in range(len(c))
+        ]
+        if len(np.unique(c.axes["table"])) > 1:
+            alike = {lag: [n for n, own in enumerate(lags) if own == lag] for lag in lags}
+            groups += [
+                (tuple(rows), ALL_TABLES) for rows in alike.values() if len(rows) > 1
+            ]
+        terms += [
+            Term(
+                f"a_{lags[rows[0]][0]}{lags[rows[0]][1]} of {where}",
+                {"lags": [lags[rows[0]]], "rows": rows, "of": where,
+                 "relative": AREA_UNIT / float(np.mean(c.values[list(rows)]))},
+                partial(_of_rows, c, rows),
+            )
+            for rows, where in groups
+        ]  # fmt: skip
+    return Family(SINGLE, tuple(terms), ("flat_cov",))
 
 
-def _of_row(chosen: Channel, row: int, channel: Channel) -> FloatArray | None:
-    """Change of the value of one row of a channel."""
+def _of_rows(chosen: Channel, rows: tuple[int, ...], channel: Channel) -> FloatArray | None:
+    """Equal change of the values of some rows of a channel."""
     # A channel that was stored and read again is another object with the same values.
     if channel.word != chosen.word or not np.array_equal(channel.values, chosen.values):
         return None
     if not np.array_equal(channel.axes["table"], chosen.axes["table"]):
         return None
-    return np.where(np.arange(len(channel)) == row, AREA_UNIT, 0.0)
+    return np.where(np.isin(np.arange(len(channel)), rows), AREA_UNIT, 0.0)

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 
+import numpy as np
+
 from bfsensor.device.device import Device
 from bfsensor.device.parameters import change_parameter, parameter_value
 from bfsensor.device.quantities import quantities
@@ -28,6 +30,10 @@ three times as long."""
 
 PHASES = "gates.collecting_phases"
 """Number of gates under which a pixel collects, which no device file states an uncertainty of."""
+
+HUGE, HALVINGS = 1e3, 30
+"""Multiple of the nominal value that stands for an open end of a quantity's range, and steps that find
+the end.  Derived: the steps leave 1e-6 of the nominal value; twice the multiple takes one more."""
 
 
 @dataclass(frozen=True)
@@ -75,11 +81,43 @@ class DeviceSolver:
         return quantities(self.device)[name].number(parameter_value(self.device, name))
 
     def range(self, name: str) -> tuple[float, float]:
-        """Least and greatest value that a quantity can have, in the unit of device files."""
+        """Least and greatest value that a quantity can have, in the unit of device files.
+
+        Others keep their nominal values, which limits it too: a taper ends within the pixel.
+        """
         if name == PHASES:
             return 1.0, self.device.gates.phases - 1.0
         own = quantities(self.device)[name]
-        return own.number(own.low), own.number(own.high)
+        return (
+            self._possible(name, own.number(own.low)), self._possible(name, own.number(own.high))
+        )  # fmt: skip
+
+    def _possible(self, name: str, end: float) -> float:
+        """Value nearest to an end of the range with which a device can be built.
+
+        The end itself where the nominal value is such a limit, as of two oxides of one thickness: then
+        other quantities have to change, too.
+        """
+        nominal = inner = self.nominal(name)
+        reach = HUGE * max(abs(inner), 1.0)
+        outer = float(np.clip(end, inner - reach, inner + reach))
+        if self._built(name, outer):
+            return end
+        for _ in range(HALVINGS):
+            middle = 0.5 * (inner + outer)
+            if self._built(name, middle):
+                inner = middle
+            else:
+                outer = middle
+        return end if inner == nominal else inner
+
+    def _built(self, name: str, value: float) -> bool:
+        """Whether a device with a quantity at a value can be built."""
+        try:
+            self.device_with({name: value}, self.device.operating_point.back_bias)
+        except DeviceError:
+            return False
+        return True
 
     def device_at(self, name: str, value: float, bias: float) -> Device:
         """Device with a quantity at a value [unit of device files], at one of the back biases [V].

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bfsensor.diagnose.explain.nonparametric import Coefficient, OpenWorld
-from bfsensor.diagnose.explain.terms import SINGLE
+from bfsensor.diagnose.explain.terms import ALL_TABLES, SINGLE
 from bfsensor.diagnose.report.class_words import said_p
 
 NEAR = 30.0
@@ -268,7 +268,8 @@ def _lags(own: Sequence[Coefficient]) -> str:
 
 def _single(own: Sequence[Coefficient]) -> str:
     text = "; ".join(
-        f"a_{c.where['lags'][0][0]}{c.where['lags'][0][1]} by {_amount(c)} 1e-8 / e- "
+        f"a_{c.where['lags'][0][0]}{c.where['lags'][0][1]}"
+        f"{' in all tables' if c.where.get('of') == ALL_TABLES else ''} by {_amount(c)} 1e-8 / e- "
         f"({100 * c.value * c.where['relative']:+.1f} % of the measured value)" for c in own[:4]
     )  # fmt: skip
     if len(own) > 1:

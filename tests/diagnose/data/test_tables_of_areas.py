@@ -202,6 +202,25 @@ def test_one_wrong_value_is_one_wrong_value():
     assert any("bf_long_range" in note for note in found.notes)
 
 
+def test_a_gain_that_is_wrong_for_all_tables_is_one_value():
+    """a_00 of every table by the same amount: no coupling, of whatever strength."""
+    tables = []
+    for n, wavelength in enumerate((620.0, 950.0)):
+        a = areas_at(wavelength=wavelength).copy()
+        a[0, 0] += 4e-8
+        place = Condition(wavelength=wavelength)
+        tables.append(StatedTable(table_of(a, 60 + n, error=1e-9), place, LEVEL))
+    found = diagnose_measured(measure_reduced(tables, reach=4), fixed())
+    assert found.attribution is not None and found.attribution.found == ()
+    (one,) = found.attribution.free_form.coefficients
+    assert one.where["lags"] == [(0, 0)] and len(one.where["rows"]) == 2
+    assert abs(one.value - 4.0) < 4 * one.error
+    assert (
+        "a_00 in all tables by 4" in found.said()
+        or "a_00 in all tables by 3.9" in found.said()
+    )
+
+
 def test_a_long_range_tail_is_not_one_value():
     """Many lags gain what a_00 lacks: the tail is seen without a_00, too."""
     effect = BrighterFatterLongRange({"amp": 2.5e-8, "power": 2.0})
