@@ -202,7 +202,7 @@ def _split(
     ``areas`` are those of :func:`_near_areas`.
     """
     count = len(g1)
-    # Singular vectors of what the far mode leaves of the areas, largest first.
+    # Singular vectors of the areas less those by the far mode, largest first.
     rest = areas - np.outer(g1, _project(areas, g1[:, None], weight))
     patterns = np.linalg.svd(rest * weight[:, None], full_matrices=False)[2][:NEAR_MODES]
     more = np.zeros((count, NEAR_MODES))

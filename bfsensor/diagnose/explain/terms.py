@@ -24,8 +24,10 @@ SCALE = 1e5
 """Signal [e-] at which coefficients of its powers are given.  Defined: the unit in report.json."""
 
 SINGLE = "single values"
+"""Group of terms that change one measured a_ij each, of one table or alike in all."""
+
 ALL_TABLES = "all tables"
-"""Group of terms that change one measured a_ij each."""
+"""Entry 'of' of the terms that are alike in all tables, in place of the name of one."""
 
 AREA_UNIT = 1e-8
 """Change of an a_ij for a coefficient of 1 [1/e-].  Defined: the unit in report.json."""

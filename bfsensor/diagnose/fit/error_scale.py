@@ -20,7 +20,7 @@ fraction of that; at 5, tables to lag 4 have none and no scale is found."""
 
 SMOOTH = (2.0, 4.0)
 """Powers of one over the distance that are fitted to far lags less the baseline, and are no scatter.
-Measured: of changes of 13 quantities of an ITL device (64 cells, 300 pairs of flats) that raise the rms
+Measured: of changes of 15 quantities of an ITL device (300 pairs of flats) that raise the rms
 of far lags by up to 8 errors, 0.17 is left, 0.77 with the first power alone, 0.07 with two more that
 depend on the direction; each takes a degree of freedom."""
 
@@ -42,7 +42,7 @@ class ErrorScale:
     count : int
         Number of far lags.
     scatter : float
-        Rms of what :data:`SMOOTH` leaves of the far lags less the baseline, over their stated errors.
+        Rms of the far lags about the baseline and a smooth function (:data:`SMOOTH`), in stated errors.
     factor : float
         Factor that is applied: 1 where the interval of the scale holds it, else its upper end.
     """
@@ -70,8 +70,8 @@ def scale_errors(measured: MeasuredChannels, baseline: Baseline) -> MeasuredChan
     """Scale the errors of tables of a_ij by the scatter of their far lags.
 
     Published errors may be the scatter of amplifiers instead of the error of the mean, or shared.
-    Far from a charge the response of any sensor falls smoothly with distance, so that what a smooth
-    function leaves of these lags is noise.
+    Far from a charge the response of any sensor falls smoothly with distance, so that the
+    scatter of these lags about a smooth function is noise.
 
     Parameters
     ----------
