@@ -174,7 +174,6 @@ def diagnose_measured(
         *_of_level(baseline, fit),
         *_as_stated(stated, measured, baseline, seed),
         *(_symmetries(fit) if mismatch.detected else []),
-        *_not_expanded(predictor.baseline, fit),
     ]
     attribution, advised = None, RecordingPlan()
     if mismatch.detected and explain:
@@ -192,6 +191,10 @@ def diagnose_measured(
             more += attribution.notes
             advised = plan(attribution)
             more += advised.notes
+    if attribution is None:
+        more += _not_expanded(predictor.baseline, fit)
+    else:
+        more += _not_expanded(attribution.predictor.baseline, attribution.fit)
     return Diagnosis(
         campaign=campaign,
         baseline=baseline.name,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,10 +34,22 @@ class Moved(NamedTuple):
 
 
 class Solution(NamedTuple):
-    """A value of the quantity at which the device was solved, and the change of the shifts there."""
+    """A value of a quantity at which the device was solved, and the change of the shifts there.
+
+    Attributes
+    ----------
+    value : float
+        In the unit of device files.
+    moved : Moved
+        Change of the shifts; with ``pulls`` less what these quantities change by their derivatives.
+    pulls : mapping of str to float, optional
+        Other quantities of the solved device, less their nominal values, over their spreads; by
+        default all are nominal.
+    """
 
     value: float
     moved: Moved
+    pulls: Mapping[str, float] | None = None
 
 
 class Quantity(NamedTuple):
@@ -79,13 +91,23 @@ class ChangedDevice(TemplateEffect):
         own: Quantity = self.template
         return float(next(iter(self.values.values())) - own.nominal)
 
+    @property
+    def solved_beside(self) -> Mapping[str, float] | None:
+        """Other quantities of the solved device, by their pulls; None where all are nominal."""
+        own: Quantity = self.template
+        return None if own.solved is None else own.solved.pulls
+
     def edges(self, kx: FloatArray, ky: FloatArray, shot: Shot, layout: Layout) -> Edges:
         del layout
+        return self.moved((kx, ky), shot)
+
+    def moved(self, edges: Edges, shot: Shot) -> Edges:
+        """Shifts [pixel/e-] with the change by the effect."""
         own: Quantity = self.template
         by = self.by
         if by == 0.0:
-            return kx, ky
-        moved = kx, ky
+            return edges
+        moved = edges
         part = 0.0
         if own.solved is not None:
             there, solution = own.solved.value - own.nominal, own.solved.moved

@@ -85,11 +85,12 @@ A longer step may jump over a saddle of the potential, and the point then lies o
 than its neighbours.  Chosen: at 0.6 a step may turn by 35 degrees instead of 17, and more single
 points jump; paths then take fewer steps."""
 
-_MAX_STEPS = 3000
-"""Largest number of steps of a forward trace; beyond it the point reached counts as its end.
+_MAX_STEPS = 1000
+"""Largest number of steps of a forward trace at the usual step; beyond it the point reached is its end.
 
-Chosen: more than twenty times the some 125 steps of a straight path of 100 um, so that twice as
-many change only paths that are caught where the field is weak."""
+Chosen: eight times the some 125 steps of a straight path of 100 um; the shipped devices need fewer than
+200 anywhere.  Twice as many change only paths that are caught where the field is weak, as in an implant
+that is not depleted, and these take twice as long."""
 
 _CORNER_PASSES = 20
 """Largest number of passes in which corners and the lines across them are made consistent.
@@ -400,7 +401,8 @@ def find_boundaries(
             "boundaries need the mirror planes through the centre of pixel (0, 0)"
         )
     split = _split_height(potential, surfaces)
-    steps = PathSteps(coarseness, turn, precision, _MAX_STEPS)
+    most = round(_MAX_STEPS * COARSENESS / coarseness)
+    steps = PathSteps(coarseness, turn, precision, most)
     lines = []
     for axis in (0, 1):
         pitch, along = mesh.pitch[axis], mesh.pitch[1 - axis]
@@ -543,10 +545,11 @@ def _bisect(
         steps.precision, field.zone, steps.coarseness, steps.most, position, steps.turn,
     )  # fmt: skip
     if failed:
-        z = points[np.isnan(position), 2].max()
+        x, y, z = points[np.argmax(np.isnan(position))]
+        more = " or more" if failed == drift.MOST_FAILED else ""
         raise ConvergenceError(
-            f"{failed} of {found.size} boundary points, the highest at z = {z:g} um, were not "
-            "found: no well on one side (is a pixel near its full well?)",
+            f"{failed}{more} of {found.size} boundary points, the first near x = {x:g}, y = {y:g}, "
+            f"z = {z:g} um, were not found: no well on one side (is a pixel near its full well?)",
             [],
         )
     found[missing] = position

@@ -127,6 +127,21 @@ def test_bisection_reports_seeds_without_a_watershed():
     assert np.isnan(out[0])
 
 
+def test_a_field_without_a_watershed_is_given_up_after_some_seeds():
+    nodes = np.linspace(-3.0, 13.0, 33)
+    phi = grid(lambda x, y, z: 1.0 * x - 0.1 * z + 0 * y, nodes, nodes, nodes)
+    zone = np.array([10.0, 10.0, 4.0, 9.0, 1.0])
+    number = drift.MOST_FAILED + 3
+    seeds = np.repeat([[5.0, 0.0, 3.0]], number, axis=0)
+    out = np.zeros(number)
+    failed = drift.bisect_edge(
+        phi, nodes, nodes, nodes, seeds, 0, np.full(number, 5.0), np.full(number, -1e-4),
+        np.full(number, 1e-4), 1e-6, zone, 0.5, 200, out,
+    )  # fmt: skip
+    assert failed == drift.MOST_FAILED
+    assert np.isnan(out).all()
+
+
 def test_paths_that_are_left_early_end_where_they_were_going():
     """Winding boundary: what leaves the edge on one side may yet end on the other."""
     nodes, z = np.linspace(-3.0, 13.0, 65), np.linspace(-1.0, 9.0, 41)

@@ -306,16 +306,25 @@ class _Search:
         others = [r for r in ranking if r not in good]
         self.joint.clear()
         good = refine(now.model, good, self.joint) if good else []
-        good = [self._solved(now, r) for r in good]
-        return sorted([*good, *others], key=lambda r: -r.evidence)
+        solved: list[Rival] = []
+        for rival in good:
+            solved.append(
+                self._solved(now, rival, max([r.gain for r in solved], default=0.0))
+            )
+        return sorted([*solved, *others], key=lambda r: -r.evidence)
 
-    def _solved(self, now: Explanation, rival: Rival) -> Rival:
-        """A candidate that was fitted jointly, with its gain after the device was solved there."""
+    def _solved(self, now: Explanation, rival: Rival, best: float) -> Rival:
+        """A candidate that was fitted jointly, with its gain after the device was solved there.
+
+        ``best`` is the largest gain of others.
+        """
         model = self.joint.get(rival.effect)
         if model is None or not self.resolver.acts(rival.effect):
             return rival
         try:
-            again = self.resolver.model(model, len(model.effects) - 1)
+            again = self.resolver.model(
+                model, len(model.effects) - 1, now.model.fit.total - best
+            )
         except ConvergenceError as error:
             self.notes.append(f"{rival.effect.name}: {error}")
             return rival

@@ -47,10 +47,11 @@ class Curve(NamedTuple):
     def share(self, pulls: Mapping[str, float]) -> float:
         """Part of the change at other parameters: 1 at those of the solution, 0 at the nominal ones.
 
-        It is the square of the distance along the line between both.
+        It is the distance along the line between both: predictions stay linear in the parameters, and
+        their fit has one minimum, which a square of the distance does not ensure.
         """
         along = sum(value * pulls.get(name, 0.0) for name, value in self.pulls.items())
-        return (along / sum(value**2 for value in self.pulls.values())) ** 2
+        return along / sum(value**2 for value in self.pulls.values())
 
 
 @dataclass(frozen=True, eq=False)

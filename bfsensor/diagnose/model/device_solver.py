@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -30,6 +31,9 @@ three times as long."""
 
 PHASES = "gates.collecting_phases"
 """Number of gates under which a pixel collects, which no device file states an uncertainty of."""
+
+NONE: Mapping[str, float] = MappingProxyType({})
+"""No quantities."""
 
 HUGE, HALVINGS = 1e3, 30
 """Multiple of the nominal value that stands for an open end of a quantity's range, and steps that find
@@ -119,8 +123,12 @@ class DeviceSolver:
             return False
         return True
 
-    def device_at(self, name: str, value: float, bias: float) -> Device:
+    def device_at(
+        self, name: str, value: float, bias: float, beside: Mapping[str, float] = NONE
+    ) -> Device:
         """Device with a quantity at a value [unit of device files], at one of the back biases [V].
+
+        ``beside`` are values of other quantities.
 
         Raises
         ------
@@ -128,8 +136,8 @@ class DeviceSolver:
             There is no such device.
         """
         if name != PHASES:
-            return self.device_with({name: value}, bias)
-        here = self.device_with({}, bias)
+            return self.device_with({**beside, name: value}, bias)
+        here = self.device_with(beside, bias)
         gates = dataclasses.replace(here.gates, collecting_phases=round(value))
         return dataclasses.replace(here, gates=gates)
 
@@ -150,9 +158,15 @@ class DeviceSolver:
         return here
 
     def moved(
-        self, name: str, value: float, *, cells: int = COARSE, levels: bool = False
+        self,
+        name: str,
+        value: float,
+        *,
+        cells: int = COARSE,
+        levels: bool = False,
+        beside: Mapping[str, float] = NONE,
     ) -> Moved:
-        """Change of the shifts by a quantity at another value.
+        """Change of the shifts from the nominal device by a quantity at another value.
 
         Parameters
         ----------
@@ -164,6 +178,8 @@ class DeviceSolver:
             Mesh cells a pixel of the shifts' change.
         levels : bool
             Whether its dependence on the level is solved too, on :data:`COARSE` cells.
+        beside : mapping of str to float
+            Values of other quantities that are not nominal.
 
         Returns
         -------
@@ -181,7 +197,7 @@ class DeviceSolver:
         bends: list[tuple[Key, Edges]] = []
         for bias in self.biases:
             pair = (
-                self.device_at(name, value, bias),
+                self.device_at(name, value, bias, beside),
                 self.device_at(name, self.nominal(name), bias),
             )
             new, old = self._both(*pair, cells, (LEVEL,))

@@ -16,7 +16,7 @@ from bfsensor.diagnose.data.exposure_info import label_of
 from bfsensor.diagnose.data.map_channels import MapShare
 from bfsensor.diagnose.data.measure_channels import MeasuredChannels
 from bfsensor.diagnose.kinds import KINDS
-from bfsensor.diagnose.model.baseline import Baseline
+from bfsensor.diagnose.model.baseline import Baseline, Curve
 from bfsensor.diagnose.model.effect_chain import EffectChain, layout_of, pad_areas
 from bfsensor.diagnose.model.effect_parameters import effects_at, parameters_of
 from bfsensor.diagnose.model.flat_predictions import (
@@ -25,6 +25,7 @@ from bfsensor.diagnose.model.flat_predictions import (
     quadrant,
 )
 from bfsensor.diagnose.model.spot_predictor import SpotPredictor, width_of
+from bfsensor.effects.changed_device import ChangedDevice
 from bfsensor.effects.effect import Effect, Layout, Shot
 from bfsensor.files import Cache
 from bfsensor.inference.parameters import FreeParameter, ParameterSpace
@@ -164,6 +165,7 @@ class Predictor:
         self, measured: MeasuredChannels, baseline: Baseline, effects: Sequence[Effect] = ()
     ) -> None:
         self.measured, self.baseline = measured, baseline
+        self._curved = baseline
         self.layout = layout_of(measured, baseline)
         self.kept = Cache()
         self._of_channels = Cache()
@@ -241,14 +243,34 @@ class Predictor:
             Effects in place of the present ones.
         point : ndarray, optional
             Start values of the parameters other than the effects'.
+
+        Notes
+        -----
+        Where the device was solved at an effect's value and the fitted quantities together, that
+        solution takes the place of the baseline's own one at fitted quantities, its ``curve``.
         """
         other = copy(self)
+        solved = [e.solved_beside for e in effects if isinstance(e, ChangedDevice)]
+        pulls = next((p for p in solved if p is not None), None)
+        other._solve_at(pulls)
         plain = self.space.without("effect")
         if point is not None:
             plain = plain.started(point[: len(plain)])
         other.effects = tuple(effects)
         other.space = plain + parameters_of(other.effects)
         return other
+
+    def _solve_at(self, pulls: Mapping[str, float] | None) -> None:
+        """Leave the baseline's curve to an effect that was solved at pulls; None: to the baseline."""
+        whole, before = self._curved, self.baseline
+        if pulls is None:
+            self.baseline = whole
+        else:
+            self.baseline = replace(whole, curve=Curve(dict(pulls), {}))
+        has = [b.curve is not None and bool(b.curve.edges) for b in (before, self.baseline)]
+        if has[0] != has[1]:
+            # Cached results depend on the baseline.
+            self.kept, self.spots = Cache(), self.spots.with_baseline(self.baseline, None)
 
     def with_columns(self, columns: Columns, point: FloatArray | None = None) -> Predictor:
         """Make a copy with further linear parameters, whose fits start at ``point``."""
@@ -300,6 +322,7 @@ class Predictor:
                 for k in own.edges
             }
         other.baseline = replace(own, **changed)  # type: ignore[arg-type]
+        other._curved = replace(self._curved, **changed)  # type: ignore[arg-type]
         # Cached results depend on the baseline.
         other.kept, other.spots = Cache(), self.spots.with_baseline(other.baseline, slopes)
         return other

@@ -8,7 +8,7 @@ import pytest
 
 from bfsensor import Device
 from bfsensor.diagnose.data.channels import PER_ELECTRON
-from bfsensor.diagnose.explain.solved_again import MOST_SOLVED, Resolver
+from bfsensor.diagnose.explain.solved_again import MOST_SOLVED, WORSE, Resolver
 from bfsensor.diagnose.model.device_solver import PHASES, DeviceSolver
 from bfsensor.effects.changed_device import Moved, Quantity, Solution
 from bfsensor.effects.device_parameter import device_parameters
@@ -21,6 +21,7 @@ KEY = (620.0, -50.0)
 SHOT = Shot("flat", 0, 1.0, *KEY, 173.15)
 LAYOUT = Layout((8, 8), ())
 NOMINAL, TRUTH = 2.0, 5.0
+OTHER = "gates.field_oxide"
 
 
 def shape(size):
@@ -43,36 +44,53 @@ def family(**solved):
     return replace(made, template=made.template._replace(**solved))
 
 
+def together(by, other):
+    """What another quantity adds to the shift: a part of its own, and one that grows with the first."""
+    return other * (2e-7 + 5e-8 * by)
+
+
 class Solver:
     def __init__(self, refuses=np.inf):
         self.asked, self.refuses = [], refuses
 
-    def moved(self, name, value, *, cells, levels):
+    def moved(self, name, value, *, cells, levels, beside):
         self.asked.append((value, cells, levels))
+        self.beside = beside
         if value > self.refuses:
             raise DeviceError("not depleted")
-        return Moved(((KEY, shape(response(value))),))
+        size = response(value) + together(value - NOMINAL, beside.get(OTHER, 0.0))
+        return Moved(((KEY, shape(size)),))
 
 
 class Fit:
-    """Model of one number, the shift that was measured, which the effect is fitted to."""
+    """Model of one number, the shift that was measured, which the effect is fitted to.
 
-    def __init__(self, effects):
+    Another quantity has a pull, which the baseline predicts by its derivative.
+    """
+
+    def __init__(self, effects, pull=0.0):
         channel = SimpleNamespace(
             word="flat_cov", unit=PER_ELECTRON, axes={"level": np.array([4e4, 4e4])}
         )
-        self.fit = SimpleNamespace(channels=[channel])
+        baseline = SimpleNamespace(
+            units={OTHER: "um"}, spread={OTHER: 2.0}, nominal={OTHER: 0.0}, temperature=173.15,
+            derivative=lambda name, key: shape(2e-7),
+        )  # fmt: skip
+        self.predictor = SimpleNamespace(baseline=baseline)
+        self.other = 2.0 * pull
+        self.fit = SimpleNamespace(channels=[channel], total=0.0, pulls={OTHER: pull})
         self.effects = [self._fitted(effects[0])]
 
     def _fitted(self, effect):
         values = np.linspace(*effect.parameters[0].ends, 20001)
         (name,) = effect.values
         got = np.array([shift(effect.with_values(**{name: v})) for v in values])
-        best = values[np.argmin(abs(got - response(TRUTH)))]
+        true = response(TRUTH) + together(TRUTH - NOMINAL, self.other)
+        best = values[np.argmin(abs(got + 2e-7 * self.other - true))]
         return effect.with_values(**{name: float(best)})
 
     def with_effects(self, effects):
-        return Fit(effects)
+        return Fit(effects, self.fit.pulls[OTHER])
 
 
 def shift(effect):
@@ -105,12 +123,46 @@ def test_the_fitted_value_is_that_of_the_solved_device():
     assert again["silicon.thickness"] == pytest.approx(TRUTH, abs=0.02)
 
 
+def test_the_device_is_solved_with_all_fitted_quantities_at_once():
+    solver = Solver()
+    linear = Fit([family()({"silicon.thickness": 3.0})], pull=1.5)
+    found = Resolver(solver).model(linear, 0).effects[0]
+    assert solver.beside == {OTHER: 3.0}
+    assert found["silicon.thickness"] == pytest.approx(TRUTH, abs=0.15)
+    assert found.solved_beside == {OTHER: 1.5}
+    # With the quantity alone its value would take what both together do.
+    alone = replace(found.of, template=found.template._replace(
+        solved=Solution(TRUTH, Moved(((KEY, shape(response(TRUTH))),)))))  # fmt: skip
+    wrong = Fit([alone({"silicon.thickness": TRUTH})], pull=1.5).effects[0]
+    assert abs(wrong["silicon.thickness"] - TRUTH) > 0.5
+
+
+def test_a_step_beyond_the_possible_is_halved():
+    solver = Solver(refuses=3.5)
+    linear = Fit([family()({"silicon.thickness": 3.0})])
+    resolver = Resolver(solver)
+    found = resolver.model(linear, 0).effects[0]
+    assert [value for value, *_ in solver.asked][:2] == pytest.approx([4.5, 3.3])
+    assert found.template.solved.value < 3.5
+    assert "taken by its derivative, not solved at" in resolver.notes[0]
+
+
+def test_a_fit_that_is_worse_than_another_is_not_solved_for_again():
+    solver = Solver()
+    linear = Fit([family()({"silicon.thickness": 3.0})])
+    Resolver(solver).model(linear, 0, best=-2 * WORSE)
+    assert len(solver.asked) == 1
+
+
 def test_what_has_no_solution_is_taken_by_its_derivative_and_noted():
-    resolver = Resolver(Solver(refuses=3.0))
+    resolver = Resolver(Solver(refuses=2.1))
     linear = Fit([family()({"silicon.thickness": 3.0})])
     assert resolver.model(linear, 0) is linear
     (note,) = resolver.notes
-    assert "device_parameter:silicon.thickness: not solved at 4.5" in note
+    assert (
+        "device_parameter:silicon.thickness: taken by its derivative, not solved at 4.5"
+        in note
+    )
 
 
 def test_nothing_is_solved_without_a_device_or_between_numbers_of_gates():
