@@ -192,8 +192,10 @@ def plan(
         if recording.rule is None and not recording.again:
             try:
                 found = here.forecasts(recording.planned)
-            except DiagnosisError:
-                continue  # The campaign has no such light, so that it cannot be predicted.
+            except (DiagnosisError, ConvergenceError):
+                # The campaign has no such light, or its spots are no longer spots, as when wells are
+                # full: it cannot be predicted.
+                continue
             if found:
                 made[recording.name] = found
     advised, notes = [], []
@@ -211,7 +213,7 @@ def plan(
         for recording in candidates:
             try:
                 values = _expected(recording, here, there, made, found_, rival)
-            except DiagnosisError as error:
+            except (DiagnosisError, ConvergenceError) as error:
                 notes.append(
                     f"no forecast of {recording.name} for {found_.effect.word} and "
                     f"{rival.word}: {error}"

@@ -13,6 +13,7 @@ from bfsensor.diagnose.plan.catalogue import RULES, make_recordings
 from bfsensor.diagnose.plan.forecast import Forecaster
 from bfsensor.diagnose.plan.gaps import ALWAYS, NEEDS, find_untested
 from bfsensor.diagnose.plan.planned_exposures import Forecast, Information, Planned
+from bfsensor.errors import ConvergenceError
 from tests.diagnose.conftest import TIED_SEED
 from tests.measured import measure_once
 from tests.virtual import (
@@ -220,6 +221,15 @@ def test_no_recording_is_advised_where_effects_take_little(tied):
     none = plan(replace(tied, shares=shares))
     assert not none.advised and "effects take 40 %" in none.notes[0]
     assert plan(replace(tied, shares=shares | {"effects": 0.5, "left": 0.3})).advised
+
+
+def test_what_a_rival_cannot_predict_is_noted(tied, monkeypatch):
+    def full(self, forecasts, other):
+        raise ConvergenceError("widths of spots still move", [])
+
+    monkeypatch.setattr(Forecaster, "same", full)
+    notes = [n for n in plan(tied).notes if n.startswith("no forecast of")]
+    assert notes and all("widths of spots still move" in n for n in notes)
 
 
 def test_recordings_cover_what_the_design_names(tied):
