@@ -24,6 +24,7 @@ from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.diagnose.model.open_baseline import simulate_baseline
 from bfsensor.diagnose.model.table_baseline import baseline_of_table, with_operating_point
 from bfsensor.diagnose.report.diagnosis_result import Diagnosis
+from bfsensor.effects.changed_device import Quantity
 from bfsensor.errors import ConvergenceError
 from bfsensor.recording.tables.area_changes import AreaChangeTable
 
@@ -74,6 +75,8 @@ def with_device(name: str, other: str, *, keep: Path) -> Baseline:
         derivatives={**line.derivatives, **card.derivatives},
         spread={**line.spread, **card.spread},
         nominal={**line.nominal, **{n: parameter_value(device, n) for n in CARD}},
+        units={**line.units, **card.units},
+        accuracy=card.accuracy,
     )
 
 
@@ -88,7 +91,10 @@ def free_one(
     """One parameter of the device without its prior: value, error, chi-square, p-value that is left."""
     (name,) = baseline.derivatives
     predictor, fit = fit_bounded(measure_reduced(table, reach=baseline.reach), baseline)
-    kind = next(k for k in candidates_of(baseline) if k.variant == name)
+    kind = next(
+        k for k in candidates_of(baseline)
+        if isinstance(getattr(k, "template", None), Quantity) and k.template.name == name
+    )  # fmt: skip
     models = []
     for start in kind.starts(predictor.layout):
         try:

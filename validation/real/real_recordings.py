@@ -176,7 +176,7 @@ def explain_areas(shared: Path) -> Rows:
     out += named("areas", "e2v: device free", found)
     for name, pull in found.fit.pulls.items():
         out.append(row("areas", "pull", pull, of=f"e2v: device free, {name}"))
-    for name in whole.derivatives:
+    for name in whole.units:
         value, error, square, p = real_areas.free_one(table, real_areas.only(whole, name))
         off = (value - whole.nominal[name]) / whole.spread[name]
         out.append(row("areas", "one parameter", value, error, at=square, of=name,
