@@ -9,7 +9,7 @@ from bfsensor.diagnose.detect.candidate_screen import Screen
 from bfsensor.diagnose.detect.candidates import candidates_of, rank, seen_of, tellable
 from bfsensor.diagnose.detect.locate import Mismatch, locate_mismatch
 from bfsensor.diagnose.detect.model_error import charge
-from bfsensor.diagnose.explain.attribution import Attribution
+from bfsensor.diagnose.explain.attribution import TIED, Attribution
 from bfsensor.diagnose.explain.nonparametric import Columns, FreeFit, explain_outside
 from bfsensor.diagnose.explain.pursuit import Dictionary
 from bfsensor.diagnose.explain.terms import SINGLE, Family, Scene, lag_family
@@ -28,7 +28,10 @@ def explain_single_value(
     gain that is wrong for all acts on a_00 alone.  If nothing stands out without it, and no effect of
     the library explains the others better than noise does, then no physics has been seen: one value
     differs from the baseline.  Effects that would explain it, such as area that
-    is gained beyond the table's lags where a_00 is too negative, are listed.
+    is gained beyond the table's lags where a_00 is too negative, are listed.  A lag that is off in all
+    tables was seen more than once: an effect with one parameter that describes it as well as the value
+    does, such as memory of the last pixel for a_10, is asked first.  Effects with more parameters, such
+    as coupling, can imitate an a_00 of a wrong gain.
 
     Parameters
     ----------
@@ -45,7 +48,7 @@ def explain_single_value(
     -------
     Attribution or None
         With one nonparametric term for the value; None where other values stand out as well, or
-        an effect is seen in them, or the channels are no a_ij.
+        an effect is seen in them or describes a lag of all tables, or the channels are no a_ij.
     """
     if any(c.unit != PER_ELECTRON for c in fit.channels) or len(fit.channels) != 1:
         return None
@@ -73,6 +76,11 @@ def explain_single_value(
     )
     kinds = tellable(candidates_of(predictor.baseline), predictor, fit.channels)
     ranking = rank(Screen(predictor, fit, seen_of(mismatch)), kinds)
+    as_simple = [r for r in ranking if len(fitted(r.effect)) == 1 and not r.refuted]
+    if len(own.where["rows"]) > 1 and any(
+        r.gain > choice.z[0] ** 2 - 2 * TIED for r in as_simple
+    ):
+        return None
     told = explain_outside(model, mismatch, ranking, free=free, seed=seed)
     if told is None:
         return None

@@ -255,11 +255,22 @@ def _phases(solver: DeviceSolver) -> list[EffectFamily]:
     for variant, value in (("fewer_gates", nominal - 1), ("more_gates", nominal + 1)):
         if not low <= value <= high:
             continue
-        piece = Piece(variant, PHASES, 1.0, SOURCE.format(f"{value:g} collecting gates"))
-        with contextlib.suppress(DeviceError, ConvergenceError):
-            moved = solver.moved(PHASES, value)
-            ends = min(value, nominal), max(value, nominal)
-            found.append(_family(solver, piece, Solution(value, moved), ends))
+        edges: list[tuple[Key, Edges]] = []
+        biases = []
+        for bias in solver.biases:
+            # Where one back bias cannot be solved, templates are those of the nearest one.
+            with contextlib.suppress(DeviceError, ConvergenceError):
+                one = dataclasses.replace(solver, biases=(bias,))
+                edges += one.moved(PHASES, value).edges
+                biases.append(bias)
+        if not edges:
+            continue
+        words = f"{value:g} collecting gates"
+        if len(biases) < len(solver.biases):
+            words += f", at {', '.join(f'{b:g} V' for b in biases)} alone"
+        piece = Piece(variant, PHASES, 1.0, SOURCE.format(words))
+        ends = min(value, nominal), max(value, nominal)
+        found.append(_family(solver, piece, Solution(value, Moved(tuple(edges))), ends))
     return found
 
 

@@ -29,6 +29,7 @@ from bfsensor.effects.bf_long_range import BrighterFatterLongRange
 from bfsensor.errors import DeviceError, DiagnosisError, RecordingError
 from bfsensor.recording.tables.area_changes import AreaChangeTable
 from bfsensor.response.edge_response import LEVEL, area_matrix
+from validation.silicon.truths import LAGS, MEMORY, read_out
 
 ERROR = 3e-9
 DEVICE = find_baseline("itl_sta3800c_60")
@@ -219,6 +220,23 @@ def test_a_gain_that_is_wrong_for_all_tables_is_one_value():
         "a_00 in all tables by 4" in found.said()
         or "a_00 in all tables by 3.9" in found.said()
     )
+
+
+def test_memory_that_is_off_in_all_tables_is_memory():
+    """A lag that deviates alike in all tables is one value only where no simple effect makes it so."""
+    share = 1e-3
+    tables = []
+    for n, wavelength in enumerate((620.0, 950.0)):
+        # The next pixel in the row has a part of this one's signal, by code of another engine.
+        a = areas_at(wavelength=wavelength)[:LAGS, :LAGS]
+        a = read_out(a, MEMORY, share)
+        place = Condition(wavelength=wavelength)
+        tables.append(StatedTable(table_of(a, 70 + n, error=1e-9), place, LEVEL))
+    found = diagnose_measured(measure_reduced(tables, reach=4), fixed())
+    assert found.attribution is not None
+    (one,) = found.attribution.found
+    assert one.effect.word == "electronic_memory"
+    assert one.effect["alpha"] == pytest.approx(share, rel=0.1)
 
 
 def test_a_long_range_tail_is_not_one_value():
