@@ -29,7 +29,6 @@ from bfsensor.effects.bf_long_range import BrighterFatterLongRange
 from bfsensor.errors import DeviceError, DiagnosisError, RecordingError
 from bfsensor.recording.tables.area_changes import AreaChangeTable
 from bfsensor.response.edge_response import LEVEL, area_matrix
-from validation.silicon.truths import LAGS, MEMORY, read_out
 
 ERROR = 3e-9
 DEVICE = find_baseline("itl_sta3800c_60")
@@ -222,14 +221,24 @@ def test_a_gain_that_is_wrong_for_all_tables_is_one_value():
     )
 
 
+def remembered(a, share):
+    """a_ij of flats whose pixels pass a part to the next in the row, as measured with the flats' gain."""
+    side, at = 4 * len(a), np.arange(-len(a) + 1, len(a))
+    wide, kernel = np.zeros((2, side, side))
+    wide[np.ix_(at, at)] = a[np.ix_(abs(at), abs(at))]
+    wide[0, 0] += 1 / LEVEL
+    kernel[0, :2] = 1 - share, share
+    out = np.fft.ifft2(np.fft.fft2(wide) * abs(np.fft.fft2(kernel)) ** 2).real
+    out[0, 0] -= (kernel**2).sum() / LEVEL
+    return out[: len(a), : len(a)]
+
+
 def test_memory_that_is_off_in_all_tables_is_memory():
     """A lag that deviates alike in all tables is one value only where no simple effect makes it so."""
     share = 1e-3
     tables = []
     for n, wavelength in enumerate((620.0, 950.0)):
-        # The next pixel in the row has a part of this one's signal, by code of another engine.
-        a = areas_at(wavelength=wavelength)[:LAGS, :LAGS]
-        a = read_out(a, MEMORY, share)
+        a = remembered(areas_at(wavelength=wavelength), share)
         place = Condition(wavelength=wavelength)
         tables.append(StatedTable(table_of(a, 70 + n, error=1e-9), place, LEVEL))
     found = diagnose_measured(measure_reduced(tables, reach=4), fixed())

@@ -82,7 +82,7 @@ class Fit:
         self.effects = [self._fitted(effects[0])]
 
     def _fitted(self, effect):
-        values = np.linspace(*effect.parameters[0].ends, 20001)
+        values = np.linspace(*effect.parameters[0].ends, 4001)
         (name,) = effect.values
         got = np.array([shift(effect.with_values(**{name: v})) for v in values])
         true = response(TRUTH) + together(TRUTH - NOMINAL, self.other)
