@@ -222,7 +222,7 @@ def test_a_gain_that_is_wrong_for_all_tables_is_one_value():
 
 
 def remembered(a, share):
-    """a_ij of flats whose pixels pass a part to the next in the row, as measured with the flats' gain."""
+    """a_ij of flats whose pixels pass a part to the next in the row, in units of the flats' own gain."""
     side, at = 4 * len(a), np.arange(-len(a) + 1, len(a))
     wide, kernel = np.zeros((2, side, side))
     wide[np.ix_(at, at)] = a[np.ix_(abs(at), abs(at))]
