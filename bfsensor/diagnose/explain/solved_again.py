@@ -123,7 +123,22 @@ class Resolver:
             if self.acts(effect) and effect.by:
                 again = self._solved(model, n, FINE, levels=several)
                 model = model if again is None else _with(model, n, again)
+                self._note_far(model.effects[n])
         return model
+
+    def _note_far(self, effect: Effect) -> None:
+        """Note a fitted value that is far from where the device was solved."""
+        if (
+            self.acts(effect)
+            and effect.solved_beside is not None
+            and not self._is_near(effect)
+        ):
+            own: Quantity = effect.template
+            assert own.solved is not None
+            self._note(
+                f"{effect.name}: the fitted value {own.nominal + effect.by:.3g} is extrapolated from a "
+                f"solution at {own.solved.value:.3g}"
+            )
 
     def _is_near(self, effect: ChangedDevice) -> bool:
         own: Quantity = effect.template

@@ -147,6 +147,18 @@ def test_a_step_beyond_the_possible_is_halved():
     assert "taken by its derivative, not solved at" in resolver.notes[0]
 
 
+def test_a_value_far_from_its_solution_is_noted():
+    resolver = Resolver(Solver(refuses=3.5))
+    linear = Fit([family()({"silicon.thickness": 3.0})])
+    found = resolver.settled(linear).effects[0]
+    own = found.template.solved.value
+    assert own < 3.5 < found["silicon.thickness"]
+    assert any(f"is extrapolated from a solution at {own:.3g}" in n for n in resolver.notes)
+    resolver = Resolver(Solver())
+    resolver.settled(Fit([family()({"silicon.thickness": 3.0})]))
+    assert resolver.notes == []
+
+
 def test_a_fit_that_is_worse_than_another_is_not_solved_for_again():
     solver = Solver()
     linear = Fit([family()({"silicon.thickness": 3.0})])
