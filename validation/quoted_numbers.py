@@ -23,6 +23,7 @@ from astropy.table import Row, Table
 from validation.concealed.goals import QUOTED, quoted_goal
 from validation.correction.quoted import CORRECTED
 from validation.index import Age, read_ages, read_claims
+from validation.silicon.counts import SILICON_CASES
 from validation.silicon.quoted import SILICON_PIECES
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -512,6 +513,7 @@ def _numbers() -> dict[str, Callable[[Rows], str]]:
         numbers[f"left {short}"] = lambda r, s=sensor, n=name: correction_left(r, s, n)
     numbers.update(CORRECTED)
     numbers.update(SILICON_PIECES)
+    numbers.update(SILICON_CASES)
     for short in QUOTED:
         numbers[f"independent {short}"] = lambda r, s=short: quoted_goal(
             r("independent_goals"), s

@@ -36,11 +36,14 @@ class Scene:
     right, upper : tuple of three ndarrays, or None
         Light along the right (upper) edge of each pixel [e-/pixel] and its first and second
         derivative towards larger x (y).  None for flats: the light of the pixel itself.
+    even : ndarray, or None
+        Light of the lamp alone, whose charge repels evenly; by default all light.
     """
 
     light: Image
     right: tuple[Image, Image, Image] | None = None
     upper: tuple[Image, Image, Image] | None = None
+    even: Image | None = None
 
     def scale(self, factor: Image | float) -> None:
         """Multiply the light by a number or by a map that is smooth over a pixel."""

@@ -83,6 +83,8 @@ CLASSES = {
     **dict.fromkeys(OUTSIDE, "outside_library"),
 }  # fmt: skip
 """Class of report.json of changes that are no quantity of a device."""
+SHARES = {BLUR: "ax", MEMORY: "alpha"}
+"""Parameters of report.json that hold the shares of a signal that moves."""
 
 
 def draw_case(
@@ -441,18 +443,23 @@ def score(name: str, case: str, truth: Mapping[str, Any], reports: Path) -> dict
     values = {k: v for e in report["effects"] for k, v in e["parameters"].items()}
     inside = []
     for quantity in truth["change"]:
-        known = values.get(quantity)
+        known = values.get(SHARES.get(quantity, quantity))
         if known is not None and "lo95" in known:
             value = true_value(device, truth, quantity)
             inside.append(bool(known["lo95"] <= value <= known["hi95"]))
     classes = {class_of(q) for q in truth["change"]}
+    # A signal that moves is no quantity, and is named by its class.
+    moved = {CLASSES[q] for q in truth["change"] if q in MOVED}
+    first = bool(named) and (
+        named[0] in truth["change"] or report["effects"][0]["class"] in moved
+    )
     heldout = report["heldout"]
     return {
         "set": name, "case": case, "engine": truth["engine"], "outside": truth["outside"],
         "concealed": " + ".join(truth["change"]) or "nothing",
         "size": " ".join(f"{v:.4g}" for v in truth["change"].values()), "snr": snr,
         "detected": bool(report["detected"]), "p": float(report["p_value"]),
-        "named": " + ".join(named) or "nothing", "first": bool(named) and named[0] in truth["change"],
+        "named": " + ".join(named) or "nothing", "first": first,
         "in_class": bool(classes & set(report["equivalence_class"])),
         "class_size": len(report["equivalence_class"]), "open_world": bool(report["open_world"]),
         "inside95": sum(inside), "intervals": len(inside), **farthest(truth, report),
@@ -477,7 +484,9 @@ def farthest(truth: Mapping[str, Any], report: Mapping[str, Any]) -> dict[str, A
 
 
 def true_value(device: Device, truth: Mapping[str, Any], name: str) -> float:
-    """Value of a concealed quantity, in the unit of device files."""
+    """Value of a concealed quantity, in the unit of device files, or share of a signal that moves."""
+    if name in SHARES:
+        return float(truth["change"][name])
     if name == GATES:
         return float(device.gates.collecting_phases + truth["change"][name])
     own = parameter_value(device, name) + truth["scatter"].get(name, 0.0)

@@ -432,7 +432,7 @@ class Screen:
         gain = float(template @ (2 * self.fit.left - template))
         return Rival(
             best, gain, evidence(best, names, gain, found.jac / scales), template,
-            *self._select_gain(template),
+            *self._select_gain(best, template),
         )  # fmt: skip
 
     def _shown(self, effect: Effect) -> set[int]:
@@ -442,8 +442,11 @@ class Screen:
         least = HIDDEN * sum(squares)
         return {n for n, square in enumerate(squares) if square > least}
 
-    def _select_gain(self, template: FloatArray) -> tuple[float, float]:
-        """Gain in the fold 'select' with the amplitude of the others, and its expected share."""
+    def _select_gain(self, effect: Effect, template: FloatArray) -> tuple[float, float]:
+        """Gain in the fold 'select' with the amplitude of the others, and its expected share.
+
+        What differs at random from flat to flat, such as the rows of a tear, is not held against it.
+        """
         own = self._select
         inside = float(template[own] @ template[own])
         outside = float(template[~own] @ template[~own])
@@ -453,9 +456,25 @@ class Screen:
             return float("nan"), 0.0
         factor = float(template[~own] @ self.fit.left[~own]) / outside
         residuals = self.fit.left[own]
-        after = residuals - factor * template[own]
-        gain = float(residuals @ residuals - after @ after)
+        left = self.fit.left - factor * template
+        gain = float(residuals @ residuals - left[own] @ left[own])
+        if gain < 0:
+            gain += self._at_random(effect, left)
         return gain, inside / (inside + outside)
+
+    def _at_random(self, effect: Effect, left: FloatArray) -> float:
+        """Part of the chi-square of residuals in the fold 'select' that an effect's random part takes."""
+        alone = self.predictor.with_effects((effect,), self.point)
+        taken = 0.0
+        for channel, start in zip(self.fit.channels, self.fit.starts, strict=False):
+            if channel.fold != "select":
+                continue
+            modes = channel.whiten(alone.modes(channel, alone.start))
+            if modes.shape[1]:
+                shapes, sizes, _ = np.linalg.svd(modes, full_matrices=False)
+                along = shapes.T @ left[int(start) : int(start) + len(channel)]
+                taken += float(np.sum(along**2 * sizes**2 / (1 + sizes**2)))
+        return taken
 
 
 def evidence(

@@ -188,17 +188,21 @@ def plan(
     if candidates is None:
         candidates = make_recordings(here.usual, here.brightest, here.brightest_spot)
     made: dict[str, list[Forecast]] = {}
+    advised: list[Advice] = []
+    notes: list[str] = []
     for recording in candidates:
         if recording.rule is None and not recording.again:
             try:
                 found = here.forecasts(recording.planned)
-            except (DiagnosisError, ConvergenceError):
-                # The campaign has no such light, or its spots are no longer spots, as when wells are
-                # full: it cannot be predicted.
+            except DiagnosisError:
+                # The campaign has no such light.
+                continue
+            except ConvergenceError as error:
+                # Spots are no longer spots, as when wells are full.
+                notes.append(f"no forecast of {recording.name}: {error}")
                 continue
             if found:
                 made[recording.name] = found
-    advised, notes = [], []
     for found_, rival in pairs:
         names = [e.name for e in model.effects]
         effects = list(model.effects)

@@ -1,10 +1,12 @@
 """Amplitudes of candidates at their starting points."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from bfsensor.diagnose.detect.candidate_screen import _best_factor, evidence
+from bfsensor.diagnose.detect.candidate_screen import Rival, Screen, _best_factor, evidence
 from bfsensor.effects.effect import Effect, Parameter
 from bfsensor.effects.persistence import TwoTimesPersistence
 
@@ -69,3 +71,45 @@ def test_no_fit_goes_beyond_what_physics_allows():
         0.0,
         15.0,
     )
+
+
+class Values:
+    """Channel of ten values with unit errors."""
+
+    def __init__(self, fold):
+        self.fold = fold
+
+    def __len__(self):
+        return 10
+
+    def whiten(self, values):
+        return values
+
+
+def screen(left, scatter):
+    """Screen of a fitted and a selecting channel; an effect scatters its shape by ``scatter``."""
+    out = Screen.__new__(Screen)
+    out.fit = SimpleNamespace(
+        left=left, channels=[Values("fit"), Values("select")], starts=(0, 10)
+    )
+    out._select = np.arange(20) >= 10
+    out.point = np.zeros(0)
+    alone = SimpleNamespace(start=None, modes=lambda channel, _: scatter * np.ones((10, 1)))
+    out.predictor = SimpleNamespace(with_effects=lambda effects, point: alone)
+    return out
+
+
+def test_what_scatters_at_random_does_not_refute_an_effect():
+    effect = TwoTimesPersistence({p.name: p.low for p in TwoTimesPersistence.parameters})
+    template = np.full(20, 10.0)
+    # The select fold drew far less than the fit fold, as two tears that ended in like rows.
+    left = np.concatenate([np.full(10, 10.0), np.full(10, 2.0)])
+    gains = {}
+    for scatter in (0.0, 7.0):
+        gain, share = screen(left, scatter)._select_gain(effect, template)
+        gains[scatter] = gain
+        rival = Rival(effect, 1000.0, 0.0, template, gain, share)
+        assert rival.refuted == (scatter == 0.0)
+    # (8^2 - 2^2) 10 = 600 less; of 640 all but 1 / (1 + 490) are within the scatter.
+    assert gains[0.0] == pytest.approx(-600)
+    assert gains[7.0] == pytest.approx(-600 + 640 * 490 / 491)

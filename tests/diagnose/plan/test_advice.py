@@ -232,6 +232,19 @@ def test_what_a_rival_cannot_predict_is_noted(tied, monkeypatch):
     assert notes and all("widths of spots still move" in n for n in notes)
 
 
+def test_what_the_accepted_fit_cannot_predict_is_noted(tied, monkeypatch):
+    forecasts = Forecaster.forecasts
+
+    def full(self, planned):
+        if any(p.kind == "spot" for p in planned):
+            raise ConvergenceError("wells are full", [])
+        return forecasts(self, planned)
+
+    monkeypatch.setattr(Forecaster, "forecasts", full)
+    notes = [n for n in plan(tied).notes if "wells are full" in n]
+    assert notes and all(n.startswith("no forecast of") for n in notes)
+
+
 def test_recordings_cover_what_the_design_names(tied):
     here = Forecaster(tied.predictor, tied.fit)
     made = make_recordings(here.usual, here.brightest, here.brightest_spot)

@@ -46,6 +46,25 @@ def test_null_flats_follow_the_closed_form(mu):
     assert ((covariances(expected)[0, 0] - mu) / sigma[0, 0]) ** 2 > 400
 
 
+def test_fringes_are_evened_out_by_their_charge():
+    """Stored contrast of a wave in the light, against (exp(x) - 1) / x with x = a(k) times the level."""
+    pixels, mu, period = 64, 6e4, 8
+    response = Response.of(SHIFTS, pixels)
+    wave = np.cos(2 * np.pi * np.arange(pixels) / period)[None, :]
+    light = (mu * (1 + 0.01 * wave) * np.ones((pixels, 1))).astype(np.float32)
+    scene = Scene(light, even=np.full_like(light, mu))
+    rng, stored = np.random.default_rng(5152), 0.0
+    for _ in range(40):
+        stored = stored + collect(scene, response, rng).astype(float) / 40
+    contrast = 2 * (stored * wave).mean() / mu
+    a = SHIFTS.area_changes()
+    at = np.arange(len(a)) - len(a) // 2
+    x = float((a.sum(axis=0) * np.cos(2 * np.pi * at / period)).sum() * mu)
+    error = np.sqrt(2 / (mu * pixels**2 * 40))
+    assert contrast == pytest.approx(0.01 * np.expm1(x) / x, abs=4 * error)
+    assert 0.01 - contrast > 6 * error
+
+
 def _power_of_steps(monkeypatch, mu, steps, pixels=32):
     """Power of a flat without chance: the end's response to one more charge in each step."""
     response, extra = Response.of(SHIFTS, pixels), 2e4  # far above the rounding of float32
