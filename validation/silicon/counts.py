@@ -77,7 +77,7 @@ def said(hits: Hits) -> str:
 
 SILICON_CASES: dict[str, Callable[[Rows], str]] = {
     f"silicon {name}": lambda r, n=name: said(count(of_sets(r))[n])
-    for name in ("alarms", "detected", "class", "first", "outside", "claimed", "values")
+    for name in ("alarms", "detected", "class", "first", "values")
 } | {
     "silicon seconds": lambda r: f"{np.median(of_sets(r)['cpu_s']):.0f}",
     "silicon slowest": lambda r: f"{np.max(of_sets(r)['cpu_s']):.0f}",
