@@ -15,6 +15,7 @@ from bfsensor.diagnose.data.measure_channels import MeasuredChannels, measure_ch
 from bfsensor.diagnose.detect.locate import Mismatch, locate_mismatch
 from bfsensor.diagnose.detect.matched_filters import locate_effects
 from bfsensor.diagnose.detect.silicon_or_readout import find_symmetry
+from bfsensor.diagnose.explain.attribution import Attribution
 from bfsensor.diagnose.explain.single_value import explain_single_value
 from bfsensor.diagnose.explain.stepwise import attribute
 from bfsensor.diagnose.fit.baseline_fit import (
@@ -30,6 +31,7 @@ from bfsensor.diagnose.model.unknown_level import NAME as LEVEL_NAME
 from bfsensor.diagnose.model.unknown_level import float_unknown_level
 from bfsensor.diagnose.plan.advice import RecordingPlan, plan
 from bfsensor.diagnose.report.diagnosis_result import Diagnosis
+from bfsensor.effects.changed_device import ChangedDevice
 from bfsensor.errors import ConvergenceError, DeviceError
 from bfsensor.response.edge_response import LEVEL
 
@@ -179,11 +181,12 @@ def diagnose_measured(
     if mismatch.detected and explain:
         try:
             attribution = keep.get(
-                "explained",
-                lambda: (
-                    explain_single_value(predictor, fit, mismatch, seed=seed)
-                    or attribute(predictor, fit, mismatch, seed=seed)
-                ),
+                "explained", lambda: _explained(predictor, fit, mismatch, seed)
+            )
+            found = attribution
+            attribution = keep.get(
+                "solved beside effects",
+                lambda: _solved_beside(measured, predictor.baseline, found, seed),
             )
         except ConvergenceError as error:
             more.append(f"the mismatch is located, but not explained: {error}")
@@ -228,6 +231,38 @@ def _located(
     if explain:
         return measured, predictor, fit, locate_effects(predictor, fit, seed=seed)
     return measured, predictor, fit, locate_mismatch(fit, seed=seed)
+
+
+def _explained(
+    predictor: Predictor, fit: BaselineFit, mismatch: Mismatch, seed: int
+) -> Attribution:
+    """Explain a mismatch by one value that is off, or by effects."""
+    single = explain_single_value(predictor, fit, mismatch, seed=seed)
+    return single or attribute(predictor, fit, mismatch, seed=seed)
+
+
+def _solved_beside(
+    measured: MeasuredChannels, baseline: Baseline, attribution: Attribution, seed: int
+) -> Attribution:
+    """Explanation with the device solved at its quantities as fitted beside the effects.
+
+    Without the effects other quantities were fitted, and far from those a straight line through the
+    device's response is wrong by more than the errors.  Effects of the device itself were solved beside
+    all quantities already.  What is given is returned where the same effects do not fit better.
+    """
+    found = attribution.found
+    if not found or any(isinstance(f.effect, ChangedDevice) for f in found):
+        return attribution
+    solved = _expanded(baseline, attribution.fit)
+    if solved is None:
+        return attribution
+    predictor, fit = fit_bounded(measured, solved)
+    mismatch = locate_effects(predictor, fit, seed=seed)
+    if not mismatch.detected:
+        return attribution
+    other = _explained(predictor, fit, mismatch, seed)
+    same = {f.effect.name for f in other.found} == {f.effect.name for f in found}
+    return other if same and other.fit.total < attribution.fit.total else attribution
 
 
 def _not_expanded(baseline: Baseline, fit: BaselineFit) -> list[str]:

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from astropy.table import Table
 from click.testing import CliRunner
 
 from bfsensor.cli.main import main
+from bfsensor.diagnose import diagnosis
 from bfsensor.diagnose.detect.locate import Scanner, locate_mismatch, tail_probability
 from bfsensor.diagnose.detect.scans import DEVICE_SCAN
 from bfsensor.diagnose.diagnosis import diagnose_measured
@@ -159,3 +161,41 @@ def test_a_device_far_from_nominal_is_reported_and_not_absorbed(tmp_path):
     assert set(report["location"]["channels"]) <= {c.word for c in found.fit.channels}
     assert "device" in report["said"]
     write_report(found, tmp_path)
+
+
+def explained(total, *names):
+    """Attribution with effects of these names and this chi-square."""
+    return SimpleNamespace(
+        found=tuple(SimpleNamespace(effect=SimpleNamespace(name=n)) for n in names),
+        fit=SimpleNamespace(total=total),
+    )
+
+
+@pytest.mark.parametrize(
+    ("again", "taken"),
+    [
+        (explained(90.0, "electronic_memory"), True),
+        (explained(110.0, "electronic_memory"), False),
+        (explained(80.0, "electronic_memory", "device_parameter"), False),
+    ],
+)
+def test_a_device_is_solved_beside_what_is_found(monkeypatch, again, taken):
+    asked = []
+    monkeypatch.setattr(
+        diagnosis, "_expanded", lambda baseline, fit: asked.append(fit) or baseline
+    )
+    monkeypatch.setattr(diagnosis, "fit_bounded", lambda measured, baseline: (None, None))
+    monkeypatch.setattr(
+        diagnosis, "locate_effects", lambda *_, seed: SimpleNamespace(detected=True)
+    )
+    monkeypatch.setattr(diagnosis, "_explained", lambda *_: again)
+    first = explained(100.0, "electronic_memory")
+    found = diagnosis._solved_beside(None, None, first, 1)
+    assert found is (again if taken else first)
+    assert asked == [first.fit]
+
+
+def test_a_device_that_cannot_be_solved_there_leaves_the_explanation(monkeypatch):
+    monkeypatch.setattr(diagnosis, "_expanded", lambda *_: None)
+    first = explained(100.0, "electronic_memory")
+    assert diagnosis._solved_beside(None, None, first, 1) is first

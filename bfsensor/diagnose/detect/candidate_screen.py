@@ -463,7 +463,7 @@ class Screen:
         return gain, inside / (inside + outside)
 
     def _at_random(self, effect: Effect, left: FloatArray) -> float:
-        """Part of the chi-square of residuals in the fold 'select' that an effect's random part takes."""
+        """Chi-square of residuals in the fold 'select' that an effect's random part takes."""
         alone = self.predictor.with_effects((effect,), self.point)
         taken = 0.0
         for channel, start in zip(self.fit.channels, self.fit.starts, strict=False):
