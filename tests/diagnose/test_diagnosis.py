@@ -190,7 +190,7 @@ def test_a_device_is_solved_beside_what_is_found(monkeypatch, again, taken):
     )
     monkeypatch.setattr(diagnosis, "_explained", lambda *_: again)
     first = explained(100.0, "electronic_memory")
-    found = diagnosis._solved_beside(None, None, first, 1)
+    found = diagnosis._solved_beside(None, "baseline", first, 1)
     assert found is (again if taken else first)
     assert asked == [first.fit]
 
