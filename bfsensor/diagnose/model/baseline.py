@@ -319,12 +319,20 @@ class Baseline:
         Returns
         -------
         dict of str to dict of (wavelength, back_bias) to (dkx, dky)
-            Change of the shifts for a unit of each parameter [pixel/e- per unit].
+            Change of the shifts for a unit of each parameter [pixel/e- per unit], the straight line
+            through a second solution included.
         """
-        return {
-            name: {key: self.derivative(name, key) for key in self.edges}
-            for name in self.derivatives
-        }
+        out = {}
+        for name in self.derivatives:
+            out[name] = {key: self.derivative(name, key) for key in self.edges}
+            if self.curve is None or name not in self.curve.pulls:
+                continue
+            # What :meth:`Curve.share` adds for a unit of the parameter.
+            share = self.curve.share({name: 1 / self.spread[name]})
+            for key, (x, y) in self.curve.edges.items():
+                dkx, dky = out[name][key]
+                out[name][key] = dkx + share * x, dky + share * y
+        return out
 
     def scale_at(self, key: tuple[float, float]) -> float:
         """Calculate the ratio of a_00 at a condition of ``edges`` to that at the reference.

@@ -63,6 +63,18 @@ def test_shifts_are_those_of_the_device_at_nominal_and_fitted_quantities(baselin
     assert moved.digest != baseline.digest
 
 
+def test_a_candidate_for_a_quantity_moves_shifts_as_the_fitted_quantity_does(baseline):
+    """Else what the fit gains by leaving the quantity's prior is lost between two directions."""
+    moved = expand_at(baseline, {NAME: 8.0 / baseline.spread[NAME]})
+    for one, steeper in ((baseline, 2 * 10.0), (moved, (18.0**2 - 10.0**2) / 8)):
+        slope = one.derivatives_by_condition()[NAME]
+        for key, (dkx, _) in slope.items():
+            assert dkx[2, 2] == pytest.approx(1e-9 * steeper, rel=1e-3)
+            where = Condition(wavelength=key[0], back_bias=key[1])
+            change = one.at(where, {NAME: 3.0})[0][0] - one.at(where)[0][0]
+            assert dkx[2, 2] == pytest.approx(change[2, 2] / 3.0, rel=1e-6)
+
+
 def test_curve_is_along_the_line_to_the_solution():
     curve = Curve({"a": 2.0, "b": 1.0}, {})
     assert curve.share({"a": 1.0, "b": 0.5}) == pytest.approx(0.5)
