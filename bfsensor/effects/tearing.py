@@ -194,11 +194,11 @@ class DivisaderoTearing(Tearing):
 
 
 def _relaxed(area: FloatArray, c: FloatArray, level: FloatArray) -> FloatArray:
-    """Contrast of columns that is left where charge repels charge, shape (flats, columns).
+    """Contrast of columns, relaxed by brighter-fatter feedback, shape (flats, columns).
 
-    Stored charge evens out a standing pattern in proportion to the power of the photon noise that it
-    leaves, to second order in a_ij times the level: for a_ij of 3e-6 and 1e5 electrons within 1 %.
-    ``c`` are the covariances of the flats [e-^2].  Where they are 0 nothing is evened out.
+    Stored charge takes as much of a standing pattern's power as of the photon noise's, to second order
+    in a_ij times the level: within 1 % for a_ij of 3e-6 and 1e5 electrons.  ``c`` are the covariances
+    of the flats [e-^2].  Where they are 0 nothing relaxes.
     """
     if not c.any():
         return np.broadcast_to(area, (len(level), len(area)))

@@ -52,7 +52,7 @@ def test_pixels_beyond_the_clipping_limit_and_their_neighbours_are_excluded(amp)
         assert np.abs((mean - none) / error).max() > 6
 
 
-def test_charge_evens_out_the_tear_as_it_does_the_noise():
+def test_tears_relax_as_the_noise_does():
     tear = Tearing({"amp": 0.01, **SHAPE})
     axes = {"amp": np.zeros(1), "level": np.array([LEVEL])}
     area = np.diff(tear._torn(SIDE))
