@@ -194,10 +194,10 @@ def _turned(
 
 
 def _smooth(scene: Scene, middle: Image) -> Image:
-    """Charge that the lamp's even light has brought.
+    """Charge that the even light has brought.
 
     It repels evenly where it is smooth; across the rim, where one side of the sensor would meet
-    the other, it does not, and must not act.  Fringes and other patterns of the light do act.
+    the other, it does not, and must not act.  Fringes do act.
     """
     even = scene.light if scene.even is None else scene.even
     return even * np.float32(middle.sum(dtype=np.float64) / even.sum(dtype=np.float64))

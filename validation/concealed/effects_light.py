@@ -113,6 +113,7 @@ class Fringing(Effect):
         x, y = (np.arange(n) / n - 0.5)[None, :], (np.arange(n) / n - 0.5)[:, None]
         height = x + 0.6 * y + 0.7 * x * x - 0.5 * x * y + 0.4 * y * y
         phase = 2 * np.pi * n * height / self.parameters["period"]
+        scene.even = scene.light
         scene.scale((1 + self.parameters["amp"] * np.sin(phase)).astype(np.float32))
 
 

@@ -37,7 +37,7 @@ class Scene:
         Light along the right (upper) edge of each pixel [e-/pixel] and its first and second
         derivative towards larger x (y).  None for flats: the light of the pixel itself.
     even : ndarray, or None
-        Light of the lamp alone, whose charge repels evenly; by default all light.
+        Light without fringes, whose charge repels evenly; by default all light.
     """
 
     light: Image

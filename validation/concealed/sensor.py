@@ -168,7 +168,6 @@ class VirtualSensor:
         charge = np.zeros((self.geometry.pixels,) * 2, np.float32)
         scene = self._scene(context)
         if scene is not None:
-            scene.even = scene.light
             for effect in self.effects:
                 effect.light(scene, context)
             charge = collect(
