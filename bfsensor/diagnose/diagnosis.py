@@ -256,11 +256,15 @@ def _solved_beside(
     solved = _expanded(baseline, attribution.fit)
     if solved is None:
         return attribution
-    predictor, fit = fit_bounded(measured, solved)
-    mismatch = locate_effects(predictor, fit, seed=seed)
-    if not mismatch.detected:
+    try:
+        predictor, fit = fit_bounded(measured, solved)
+        mismatch = locate_effects(predictor, fit, seed=seed)
+        if not mismatch.detected:
+            return attribution
+        other = _explained(predictor, fit, mismatch, seed)
+    except ConvergenceError:
+        # A note says that the device is far from where it was solved.
         return attribution
-    other = _explained(predictor, fit, mismatch, seed)
     same = {f.effect.name for f in other.found} == {f.effect.name for f in found}
     return other if same and other.fit.total < attribution.fit.total else attribution
 

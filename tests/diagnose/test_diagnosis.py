@@ -16,6 +16,7 @@ from bfsensor.diagnose.detect.scans import DEVICE_SCAN
 from bfsensor.diagnose.diagnosis import diagnose_measured
 from bfsensor.diagnose.report.diagnosis_result import SCHEMA
 from bfsensor.diagnose.report.html_report import write_report
+from bfsensor.errors import ConvergenceError
 from tests.virtual import (
     fit_virtual,
     make_effect,
@@ -199,3 +200,13 @@ def test_a_device_that_cannot_be_solved_there_leaves_the_explanation(monkeypatch
     monkeypatch.setattr(diagnosis, "_expanded", lambda *_: None)
     first = explained(100.0, "electronic_memory")
     assert diagnosis._solved_beside(None, None, first, 1) is first
+
+
+def test_an_explanation_is_kept_where_the_search_beside_it_does_not_converge(monkeypatch):
+    def fails(*_, **__):
+        raise ConvergenceError("no", [])
+
+    monkeypatch.setattr(diagnosis, "_expanded", lambda *_: "baseline")
+    monkeypatch.setattr(diagnosis, "fit_bounded", fails)
+    first = explained(100.0, "electronic_memory")
+    assert diagnosis._solved_beside(None, "baseline", first, 1) is first

@@ -195,6 +195,7 @@ def linear_response(low: Shifts, high: Shifts, pixels: int) -> Response:
 
     Shifts by ``k Q + e Q (1 - Q / t)`` have the derivative ``k + e (1 - 2 Q / t)``.
     """
+    # Any value gives the same shifts.
     turning = 5.0e4
     kernels = []
     for at_low, at_high in zip(low, high, strict=True):
