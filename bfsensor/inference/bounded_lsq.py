@@ -120,8 +120,13 @@ def solve_within(
     return BoundedSolution(solution, errors, covariance, q, left)
 
 
-def span(unit: FloatArray) -> FloatArray:
-    """Orthonormal basis of the space that unit columns span, without directions below SINGULAR."""
+def span(columns: FloatArray) -> FloatArray:
+    """Orthonormal basis of the space that columns span, without directions below SINGULAR.
+
+    Columns are brought to unit length first, so that their units do not decide what is dropped.
+    """
+    norms = np.sqrt((columns**2).sum(0))
+    unit = columns[:, norms > 0] / norms[norms > 0]
     q, r = np.linalg.qr(unit)
     if (np.abs(np.diag(r)) > SINGULAR).all():
         return q

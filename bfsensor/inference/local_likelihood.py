@@ -121,7 +121,8 @@ class LocalLikelihood:
         self.slopes, self.steps = slopes, steps
         here = left(best)
         self.square = float(here @ here)
-        self.covariance = np.linalg.pinv(slopes.T @ slopes, rcond=1e-12)
+        everywhere = np.full(len(best), np.inf)
+        self.covariance = solve_within(slopes, here, -everywhere, everywhere).covariance
         self.errors = np.sqrt(np.diag(self.covariance))
         self._unit = np.where(self.errors > 0, self.errors, steps)
         self.lowest = Held(self.square, best, slopes)

@@ -76,6 +76,41 @@ def test_a_bent_case_has_its_exact_profile(width):
     assert np.sqrt(rises.min()) == pytest.approx(width, rel=0.05)
 
 
+def test_the_units_of_parameters_do_not_matter():
+    """A parameter a hundred million times smaller than another, as 1/e- beside a power."""
+    unit = np.array([1e-8, 1.0, 1e3])
+
+    def left(p):
+        k = np.arange(1.0, 9.0)
+        return (2.0 * np.exp(-k / 2.0) + 0.1 - p[0] * np.exp(-k / p[1]) - p[2]) / 0.25
+
+    def found(unit):
+        parameters = [
+            Parameter(n, "", 0.1 * u, 10.0 * u, law="flat", signed=True)
+            for n, u in zip("abc", unit, strict=True)
+        ]
+        best = np.array([2.0, 2.0, 0.1])
+        step = 1e-6 * unit
+        slopes = np.stack(
+            [
+                (left(best - d / unit) - left(best + d / unit)) / (2 * s)
+                for d, s in zip(np.diag(step), step, strict=True)
+            ],
+            1,
+        )
+        own = [ranged(p) for p in parameters]
+        near = LocalLikelihood(own, best * unit, lambda p: left(p / unit), slopes, 1e-4 * unit)
+        return near, profiles_in(near, WIDTHS)
+
+    (plain, usual), (scaled, other) = found(np.ones(3)), found(unit)
+    assert scaled.errors / unit == pytest.approx(plain.errors)
+    assert usual.keys() == other.keys() >= {"a", "b"}
+    for name, u in zip("ab", unit, strict=False):
+        for width in WIDTHS:
+            low, high, *closed = other[name].interval(width)
+            assert [low / u, high / u, *closed] == pytest.approx(usual[name].interval(width))
+
+
 def test_a_parameter_that_does_not_matter_has_the_whole_range():
     told = profiles_in(valley(lambda p: np.array([3.0 * (p[0] - 1.0)]), [1.0, 4.0]), WIDTHS)
     low, high, *closed = told["shape"].interval(1.0)
