@@ -15,9 +15,16 @@ from bfsensor.device.parameters import change_parameter, device_parameters
 from bfsensor.device.quantities import quantities
 from bfsensor.diagnose.model.baseline import Baseline, Curve, Key
 from bfsensor.diagnose.model.cached_response import Walk, walk
-from bfsensor.diagnose.model.device_solver import BACKGROUNDS, COARSE, FINE, DeviceSolver
-from bfsensor.diagnose.model.mesh_error import FINEST, mesh_errors, part_of
+from bfsensor.diagnose.model.device_solver import (
+    BACKGROUNDS,
+    COARSE,
+    FINE,
+    DeviceSolver,
+    less,
+)
+from bfsensor.diagnose.model.mesh_error import FINEST, in_proportion, mesh_errors, part_of
 from bfsensor.diagnose.model.table_baseline import WAVELENGTHS
+from bfsensor.effects.changed_device import add_edges
 from bfsensor.errors import DeviceError, DiagnosisError
 from bfsensor.files import written_whole
 from bfsensor.response.edge_response import LEVEL, EdgeResponse, solve_response
@@ -26,7 +33,9 @@ from bfsensor.simulate.edge_field import front_plane
 from bfsensor.typing import Edges
 from bfsensor.units import to_celsius
 
-TABLES = "derivatives on 16 cells at every back bias, by voltages too, in their units, levels, mesh"
+TABLES = (
+    "derivatives on 16 cells at every back bias, by voltages too; levels, mesh at the first"
+)
 """Method of the shifts, part of the name of cached files: files of other methods are not read."""
 
 STEP = 1e-4
@@ -85,8 +94,10 @@ def baseline_of_device(
     warming : bool
         Whether shifts change with temperature, through absorption and the carriers' heat.
     cells : int
-        Mesh cells per pixel of the nominal device's change with the level.  Where parameters are free,
-        its shifts are those of half as many more, and their errors by the mesh are free too.
+        Mesh cells per pixel of the nominal device.  Where parameters are free, half as many more are
+        solved at the first back bias, others take their change in proportion to the shifts, and
+        errors of shifts by the mesh are free too.  The change with the level is solved at the first
+        back bias alone.
     keep : Path, optional
         Folder where solutions are cached.
     progress : callable, optional
@@ -128,7 +139,7 @@ def baseline_of_device(
     # Readings of the device's own bias are its own: solutions are those of its shipped table.
     given = [own if abs(b - own) <= 0.5 else float(b) for b in back_biases]
     biases = sorted(dict.fromkeys(given or [own]), key=lambda b: abs(b - own))
-    total, done = len(biases) * (1 + warming + 2 * bool(chosen)), 0
+    total, done = len(biases) * (1 + warming + bool(chosen)) + bool(chosen), 0
 
     def walked(changed: Device, cells: int, levels: Sequence[float] = (LEVEL,)) -> Walk:
         nonlocal done
@@ -154,16 +165,20 @@ def baseline_of_device(
     bends: dict[Key, Edges] = {}
     warmer: dict[Key, Edges] = {}
     errors: dict[str, float] = {}
+    most = cells * FINEST // FINE if chosen else cells
+    finest: Walk | None = None
     for bias in biases:
         here = change_parameter(device, "operating_point.back_bias", bias - own)
-        found = walked(here, cells, backgrounds)
+        if finest is None:
+            finest = walked(here, most, backgrounds)
+            first = found = walked(here, cells) if chosen else finest
+        else:
+            found = walked(here, cells)
         slopes_of = _derivatives(here, {n: typical[n] for n in asked}) if chosen else None
-        finest = found
         if slopes_of is not None:
             done += 1
             if progress is not None:
                 progress(done, total)
-            finest = walked(here, cells * FINEST // FINE)
             light = None if "depths" in lacks else WAVELENGTHS[0]
             errors = errors or mesh_errors(
                 *(solved.edges(light, kelvin) for solved in (slopes_of, found, finest))
@@ -173,9 +188,13 @@ def baseline_of_device(
             warm, cold = walked(hot, COARSE), walk(here, cells=COARSE, keep=keep)
         for wavelength, colour in colours.items():
             key = wavelength, bias
-            edges[key] = finest.edges(colour, kelvin)
+            fine, start, best = (w.edges(colour, kelvin) for w in (found, first, finest))
+            edges[key] = add_edges(fine, in_proportion(less(best, start), start, fine), 1.0)
             if "levels" not in lacks:
-                slopes[key], bends[key] = found.bent(colour, kelvin)
+                slopes[key], bends[key] = (
+                    in_proportion(change, best, edges[key])
+                    for change in finest.bent(colour, kelvin)
+                )
             held[key] = {}
             if slopes_of is not None:
                 dkx, dky = mixed(

@@ -15,6 +15,7 @@ from bfsensor.device.device import Device
 from bfsensor.device.parameters import change_parameter, parameter_value
 from bfsensor.device.quantities import quantities
 from bfsensor.diagnose.model.cached_response import SPAN, Walk, walk
+from bfsensor.diagnose.model.mesh_error import in_proportion
 from bfsensor.effects.changed_device import Key, Moved, QuadraticTemplate
 from bfsensor.errors import DeviceError
 from bfsensor.response.edge_response import LEVEL
@@ -177,7 +178,8 @@ class DeviceSolver:
         cells : int
             Mesh cells a pixel of the shifts' change.
         levels : bool
-            Whether its dependence on the level is solved too, on :data:`COARSE` cells.
+            Whether its dependence on the level is solved too, on :data:`COARSE` cells at the first
+            back bias; at others it is in proportion to the change.
         beside : mapping of str to float
             Values of other quantities that are not nominal.
 
@@ -205,12 +207,14 @@ class DeviceSolver:
                 edges.append(
                     ((w, bias), less(new.edges(colour, kelvin), old.edges(colour, kelvin)))
                 )
-            if levels and self.levels:
+            if levels and self.levels and bias == self.biases[0]:
                 new, old = self._both(*pair, COARSE, BACKGROUNDS)
                 for w, colour in self._colours():
                     (s, b), (s0, b0) = new.bent(colour, kelvin), old.bent(colour, kelvin)
                     slopes.append(((w, bias), less(s, s0)))
                     bends.append(((w, bias), less(b, b0)))
+        if slopes:
+            slopes, bends = (_at_all(changes, edges) for changes in (slopes, bends))
         bent = QuadraticTemplate(LEVEL, tuple(slopes), tuple(bends)) if slopes else None
         return Moved(tuple(edges), bent=bent)
 
@@ -248,6 +252,18 @@ class DeviceSolver:
         except DeviceError:
             # Surfaces that change their order need another mesh, or there is no such device.
             return solve(new), plain
+
+
+def _at_all(
+    of_first: list[tuple[Key, Edges]], edges: list[tuple[Key, Edges]]
+) -> list[tuple[Key, Edges]]:
+    """Changes with level at all conditions of ``edges``, from those at the first back bias."""
+    known, bias = dict(of_first), of_first[0][0][1]
+    shifts = dict(edges)
+    return [
+        (key, in_proportion(known[key[0], bias], shifts[key[0], bias], there))
+        for key, there in edges
+    ]
 
 
 def less(new: Edges, old: Edges, factor: float = 1.0) -> Edges:

@@ -62,6 +62,41 @@ def part_of(edges: Edges, name: str) -> Edges:
     return np.where(of_x, edges[0], 0.0), np.where(np.transpose(of_y), edges[1], 0.0)
 
 
+def in_proportion(change: Edges, here: Edges, there: Edges) -> Edges:
+    """Change of the shifts of one condition, carried to another in proportion to the shifts.
+
+    Measured on itl_sta3800c and e2v_ccd250, from their own to a back bias of 15 V less: what 48 cells
+    change over 32, carried, leaves shifts wrong by at most 0.04 and 0.3 %, where the change itself is
+    1 %; the relative change from 15,000 to 65,000 e- differs by at most 0.6 % of the shifts.
+
+    Parameters
+    ----------
+    change : tuple of ndarray, shape (2 n + 1, 2 n + 1)
+        Change of the shifts of right and upper edges at the first condition.
+    here, there : tuple of ndarray, shape (2 n + 1, 2 n + 1)
+        Shifts at the first and at the second condition.
+
+    Returns
+    -------
+    kx, ky : ndarray, shape (2 n + 1, 2 n + 1)
+        Change at the second: each of :data:`MESH` times the factor by which its shifts are larger.
+
+    Examples
+    --------
+    >>> ones = np.ones((5, 5))
+    >>> kx, _ = in_proportion((ones, ones), (ones, ones), (2 * ones, 2 * ones))
+    >>> float(kx.min()), float(kx.max())
+    (2.0, 2.0)
+    """
+    kx, ky = np.zeros_like(change[0]), np.zeros_like(change[1])
+    for name in MESH:
+        one, two, by = (np.array(part_of(e, name)) for e in (here, there, change))
+        if (size := np.vdot(one, one)) > 0:
+            more = np.vdot(one, two) / size * by
+            kx, ky = kx + more[0], ky + more[1]
+    return kx, ky
+
+
 def mesh_errors(coarse: Edges, fine: Edges, finest: Edges) -> dict[str, float]:
     """Relative errors of the shifts of the finest mesh, from two coarser ones.
 

@@ -99,7 +99,9 @@ def test_the_units_of_parameters_do_not_matter():
             1,
         )
         own = [ranged(p) for p in parameters]
-        near = LocalLikelihood(own, best * unit, lambda p: left(p / unit), slopes, 1e-4 * unit)
+        near = LocalLikelihood(
+            own, best * unit, lambda p: left(p / unit), slopes, 1e-4 * unit
+        )
         return near, profiles_in(near, WIDTHS)
 
     (plain, usual), (scaled, other) = found(np.ones(3)), found(unit)
@@ -108,7 +110,9 @@ def test_the_units_of_parameters_do_not_matter():
     for name, u in zip("ab", unit, strict=False):
         for width in WIDTHS:
             low, high, *closed = other[name].interval(width)
-            assert [low / u, high / u, *closed] == pytest.approx(usual[name].interval(width))
+            assert [low / u, high / u, *closed] == pytest.approx(
+                usual[name].interval(width)
+            )
 
 
 def test_a_parameter_that_does_not_matter_has_the_whole_range():
