@@ -12,7 +12,7 @@ the solutions of the nominal device that another one has made, which are the sam
 
 Cases: one change of a quantity, a third of them two; a fifth a change that no piece describes; a
 seventh signal that moves between pixels after collection, which is no silicon.  Sizes are log-uniform
-from 0.5 to 15 typical changes; the engines are those of :mod:`validation.silicon.truths`.
+from 0.5 (``--smallest``) to 15 typical changes.  Engines are those of :mod:`validation.silicon.truths`.
 Projected SNR: length of the change in errors after all quantities with an uncertainty have
 adapted within their priors, linearly.
 """
@@ -88,11 +88,16 @@ SHARES = {BLUR: "ax", MEMORY: "alpha"}
 
 
 def draw_case(
-    rng: np.random.Generator, device: Device, null: bool, other: str
+    rng: np.random.Generator,
+    device: Device,
+    null: bool,
+    other: str,
+    smallest: float = SMALLEST,
 ) -> dict[str, Any]:
     """Draw the device's scatter and the concealed changes; sizes in internal units.
 
-    Half of the cases whose changes the engine ``other`` has are its own.
+    Half of the cases whose changes the engine ``other`` has are its own.  No change is smaller than
+    ``smallest`` typical changes.
     """
     known = device_parameters(device)
     scatter = {
@@ -111,7 +116,7 @@ def draw_case(
     names = rng.choice(sorted(typical), size=number, replace=False)
     change = {}
     for name in names:
-        size = np.exp(rng.uniform(np.log(SMALLEST), np.log(LARGEST)))
+        size = np.exp(rng.uniform(np.log(smallest), np.log(LARGEST)))
         sign = 1.0 if name in CLASSES else rng.choice([-1.0, 1.0])
         change[str(name)] = float(sign * size * typical[name])
         if name == GATES:
@@ -256,9 +261,13 @@ def main() -> None:
     help="Program Poisson_CCD, which then is the engine of half of the cases.",
 )
 @click.option("--alone", is_flag=True, help="Draw no cases but nulls of another engine.")
+@click.option(
+    "--smallest", type=click.FloatRange(0, LARGEST, min_open=True), default=SMALLEST,
+    show_default=True, help="Smallest size of a change [typical changes].",
+)  # fmt: skip
 def make(
     folder: Path, truths: Path, count: int, nulls: int, seed: int, device: str, other: str,
-    engine: Path | None, alone: bool,
+    engine: Path | None, alone: bool, smallest: float,
 ) -> None:  # fmt: skip
     """Make cases that are not there yet."""
     if engine is not None:
@@ -274,7 +283,7 @@ def make(
             continue
         for attempt in range(100):
             rng = np.random.default_rng([seed, n, attempt])
-            case = draw_case(rng, card, n >= count, other)
+            case = draw_case(rng, card, n >= count, other, smallest)
             if alone and n < count and case["engine"] != other:
                 continue
             try:
