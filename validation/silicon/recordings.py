@@ -226,7 +226,9 @@ def exposures(size: str, biases: tuple[float, ...], dithers: int) -> list[Exposu
     return out
 
 
-def draw(rng: np.random.Generator, device: Device, null: bool) -> dict[str, Any]:
+def draw(
+    rng: np.random.Generator, device: Device, null: bool, smallest: float = SMALLEST
+) -> dict[str, Any]:
     """Draw the device's scatter and one concealed change [internal units]."""
     known = device_parameters(device)
     scatter = {
@@ -236,7 +238,7 @@ def draw(rng: np.random.Generator, device: Device, null: bool) -> dict[str, Any]
     if not null:
         typical = {**known, **VOLTS, GATES: 1.0}
         name = str(rng.choice(sorted(typical)))
-        size = np.exp(rng.uniform(np.log(SMALLEST), np.log(LARGEST)))
+        size = np.exp(rng.uniform(np.log(smallest), np.log(LARGEST)))
         change[name] = float(rng.choice([-1.0, 1.0]) * size * typical[name])
         if name == GATES:
             change[name] = float(np.sign(change[name]))
@@ -269,9 +271,13 @@ def main() -> None:
 @click.option("--dithers", default=3, show_default=True, help="Exposures of spots a flux.")
 @click.option("--device", default="itl_sta3800c", show_default=True)
 @click.option("--direct", is_flag=True, help="Build spots up electron by electron.")
+@click.option(
+    "--smallest", type=click.FloatRange(0, LARGEST, min_open=True), default=SMALLEST,
+    show_default=True, help="Smallest size of a change [typical changes].",
+)  # fmt: skip
 def make(
     folder: Path, truths: Path, count: int, nulls: int, seed: int, size: str, dithers: int,
-    device: str, direct: bool,
+    device: str, direct: bool, smallest: float,
 ) -> None:  # fmt: skip
     """Make campaigns that are not there yet."""
     card = Device.load(device)
@@ -283,7 +289,7 @@ def make(
             continue
         for attempt in range(100):
             rng = np.random.default_rng([seed, n, attempt])
-            case = draw(rng, card, n >= count)
+            case = draw(rng, card, n >= count, smallest)
             try:
                 concealed = device_of(card, case)
                 for bias in biases:
