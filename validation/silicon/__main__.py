@@ -21,18 +21,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import resource
 import shutil
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
-from astropy.table import Table, vstack
 from numpy.typing import NDArray
 
 from bfsensor.device.device import Device
@@ -40,8 +35,7 @@ from bfsensor.device.parameters import change_parameter, device_parameters, para
 from bfsensor.device.quantities import quantities
 from bfsensor.errors import BFSensorError
 from bfsensor.response.edge_response import solve_response
-from validation.common.run_header import commit_here
-from validation.common.write_results import write_results
+from validation.silicon.sealed_cases import committed_truth, diagnose_case, keep_rows
 from validation.silicon.truths import (
     BLUR,
     DOTS,
@@ -393,22 +387,13 @@ def run(folder: Path, reports: Path, device: str, shared: bool) -> None:
                 copy = shutil.copytree if name.is_dir() else shutil.copy
                 copy(name, out / name.name)
         made = out
-        words = [sys.executable, "-m", "bfsensor", "diagnose"]
-        at = []
+        given, at = [], []
         for table in sorted(place.glob("a_*.csv")):
             _, bias, wavelength = table.stem.split("_")
-            words.append(str(table))
+            given.append(str(table))
             state = f"back_bias=-{bias}V,wavelength={wavelength}nm,level=40000"
             at += ["--at", f"{table.stem}:{state}"]
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        done = subprocess.run(
-            [*words, "--baseline", device, *at, "-o", str(out)], capture_output=True, text=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-        )  # fmt: skip
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-        (out / "cost.json").write_text(json.dumps({"cpu_s": cpu, "commit": commit_here()}))
-        click.echo(f"{place.name}: {cpu:.0f} CPU s; {(done.stdout or done.stderr)[:160]}")
+        diagnose_case([*given, *at], device, out)
 
 
 @main.command("open")
@@ -422,19 +407,10 @@ def open_(folder: Path, reports: Path, truths: Path, name: str) -> None:
     rows = []
     for place in sorted(folder.glob("case_*")):
         path = truths / f"{place.name}.json"
-        if hashlib.sha256(path.read_bytes()).hexdigest() != sums[path.name]:
-            raise click.ClickException(f"{path} is not the truth that was committed to")
+        truth = committed_truth(path, sums[path.name])
         if (reports / place.name / "report.json").exists():
-            rows.append(score(name, place.name, json.loads(path.read_text()), reports))
-    table = Table(rows)
-    if RESULTS.exists():
-        old = Table.read(RESULTS, format="ascii.ecsv")
-        table = vstack([old[old["set"] != name], table], metadata_conflicts="silent")
-    write_results(
-        table, RESULTS, COMMAND, added=True, cpu_s=float(sum(r["cpu_s"] for r in rows))
-    )
-    for row in rows:
-        click.echo(json.dumps(row))
+            rows.append(score(name, place.name, truth, reports))
+    keep_rows(rows, RESULTS, COMMAND, name)
 
 
 def score(name: str, case: str, truth: Mapping[str, Any], reports: Path) -> dict[str, Any]:

@@ -17,19 +17,14 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 import json
 import os
-import resource
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
-from astropy.table import Table, vstack
 from numpy.typing import NDArray
 
 from bfsensor.device.device import Device
@@ -39,8 +34,6 @@ from bfsensor.direct.spot_exposure import Spot, SpotPlan, simulate_spot
 from bfsensor.errors import BFSensorError
 from bfsensor.response.edge_response import CHARGE, solve_response
 from bfsensor.response.light import mixed
-from validation.common.run_header import commit_here
-from validation.common.write_results import write_results
 from validation.concealed import campaign
 from validation.concealed.collect import Response, counts, transform
 from validation.concealed.plan import SIZES, Exposure, Geometry, exposures_of
@@ -48,6 +41,7 @@ from validation.concealed.readout import Context
 from validation.concealed.scene import Image, dithered_spots, spot_scene
 from validation.concealed.sensor import VirtualSensor
 from validation.silicon.__main__ import VOLTS, class_of, true_value
+from validation.silicon.sealed_cases import committed_truth, diagnose_case, keep_rows
 from validation.silicon.truths import CELLS, GATES, changed
 
 RESULTS = Path(__file__).parents[1] / "results" / "silicon_recordings.ecsv"
@@ -346,17 +340,7 @@ def run(folder: Path, reports: Path, device: str) -> None:
         out = reports / place.name
         if (out / "report.json").exists():
             continue
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        done = subprocess.run(
-            [sys.executable, "-m", "bfsensor", "diagnose", str(place), "--baseline", device,
-             "-o", str(out)],
-            capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"},
-        )  # fmt: skip
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-        out.mkdir(parents=True, exist_ok=True)
-        (out / "cost.json").write_text(json.dumps({"cpu_s": cpu, "commit": commit_here()}))
-        click.echo(f"{place.name}: {cpu:.0f} CPU s; {(done.stdout or done.stderr)[:160]}")
+        diagnose_case([str(place)], device, out)
 
 
 @main.command("open")
@@ -369,20 +353,10 @@ def open_(folder: Path, reports: Path, truths: Path, name: str) -> None:
     known = json.loads((folder / "commitments.json").read_text())
     rows = []
     for place in sorted(p for p in folder.glob("case_???") if p.is_dir()):
-        path = truths / f"{place.name}.json"
-        if hashlib.sha256(path.read_bytes()).hexdigest() != known[place.name]:
-            raise click.ClickException(f"{path} is not the truth that was committed to")
+        truth = committed_truth(truths / f"{place.name}.json", known[place.name])
         if (reports / place.name / "report.json").exists():
-            rows.append(score(name, place.name, json.loads(path.read_text()), reports))
-    table = Table(rows)
-    if RESULTS.exists():
-        old = Table.read(RESULTS, format="ascii.ecsv")
-        table = vstack([old[old["set"] != name], table], metadata_conflicts="silent")
-    write_results(
-        table, RESULTS, COMMAND, added=True, cpu_s=float(sum(r["cpu_s"] for r in rows))
-    )
-    for row in rows:
-        click.echo(json.dumps(row))
+            rows.append(score(name, place.name, truth, reports))
+    keep_rows(rows, RESULTS, COMMAND, name)
 
 
 def score(name: str, case: str, truth: Mapping[str, Any], reports: Path) -> dict[str, Any]:
