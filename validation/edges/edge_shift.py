@@ -188,7 +188,7 @@ def check_sensor(shifts: dict[tuple[str, float], EdgeShift]) -> Table:
     device = Device.load("itl_sta3800c")
     drift = solve_drift(sensor.table.device_text, 173.0, float(sensor.table.depths[1]))
     variance = np.interp(DEPTHS["itl_sta3800c"] - 1.0, drift.heights, drift.variance)
-    diffusion = float(np.sqrt(variance)) / device.pixel.pitch_x
+    diffusion = device.diffusion * float(np.sqrt(variance)) / device.pixel.pitch_x
     rows = []
     for voltage, shift in ((20.0, low), (4.0, high)):
         for distance in STAR_DISTANCES[voltage]:

@@ -195,8 +195,7 @@ def physics_left_out(
         "Einstein's relation integrated through the device's own field",
     ))  # fmt: skip
     # Electrons diffuse as the device's file says, which may exceed Einstein's relation.
-    wider = plain.transport.diffusion or 1.0
-    actual = tuple((key, wider**2 * variance) for key, variance in widths.held)
+    actual = tuple((key, plain.diffusion**2 * variance) for key, variance in widths.held)
     found += [charge_diffusion(widths._replace(held=actual))]
     found += [quantum_yield(widths._replace(held=actual))]
     found.append(_rings(drifts, colours, plain))
