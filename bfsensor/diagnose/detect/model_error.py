@@ -53,9 +53,25 @@ def charge(parameters: int, tried: int) -> float:
 
 
 def explained_by_word(before: BaselineFit, after: BaselineFit) -> dict[str, float]:
-    """Decrease of the chi-square, at least 0, by channel, between two fits of the same channels."""
+    """Decrease of the chi-square, at least 0, by channel, between two fits of the same channels.
+
+    Where parameters with a prior had taken up what an effect takes now, the chi-square of the priors
+    decreases: it counts in the channels whose residuals changed, by the squares of their changes.
+    """
     old, new = before.chi2(), after.chi2()
-    return {word: max(old[word][0] - new[word][0], 0.0) for word in old if word in new}
+    words = [word for word in old if word in new]
+    changed = before.residuals - after.residuals
+    squares = {word: float(np.sum(changed[before.of(word)] ** 2)) for word in words}
+    pulls = [
+        fit.left[len(fit.residuals) : len(fit.left) - fit.scores] for fit in (before, after)
+    ]
+    freed = (float(pulls[0] @ pulls[0]) - float(pulls[1] @ pulls[1])) / max(
+        sum(squares.values()), 1e-300
+    )
+    return {
+        word: max(old[word][0] - new[word][0] + freed * squares[word], 0.0)
+        for word in words
+    }
 
 
 def left_by_word(fit: BaselineFit, left: FloatArray | None = None) -> dict[str, float]:
