@@ -17,6 +17,7 @@ from bfsensor.diagnose.explain.nonparametric import OpenWorld
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 from bfsensor.diagnose.fit.likelihood_profile import Profile, linear_interval
 from bfsensor.diagnose.model.predictor import Predictor
+from bfsensor.effects.changed_device import ChangedDevice
 from bfsensor.effects.effect import Effect, Parameter
 
 TIED = 3.0
@@ -107,6 +108,11 @@ class Found:
     rivals: tuple[Rival, ...] = ()
     profiles: Mapping[str, Profile] = field(default_factory=dict)
     scale: float = WIDENED
+
+    @property
+    def alike(self) -> tuple[str, ...]:
+        """Other quantities of the device that these recordings do not distinguish from it."""
+        return tied_quantities(self.effect, self.rivals)
 
     def intervals(self) -> dict[str, dict[str, Any]]:
         """Values with intervals of 68 and 95 %, as report.json has them.
@@ -326,16 +332,39 @@ def tied_classes(effect: Effect, ranking: Sequence[Rival]) -> tuple[str, ...]:
     ranking : sequence of Rival
         Candidates in its place.
     """
+    return tuple(dict.fromkeys([effect.word, *(r.word for r in _tied(effect, ranking))]))
+
+
+def tied_quantities(effect: Effect, ranking: Sequence[Rival]) -> tuple[str, ...]:
+    """Quantities of the device that the recordings do not distinguish from the one that was found.
+
+    Parameters
+    ----------
+    effect : Effect
+        Effect that was found; other effects than quantities of the device have none.
+    ranking : sequence of Rival
+        Candidates in its place.
+    """
+    if not isinstance(effect, ChangedDevice):
+        return ()
+    others = [r.effect for r in _tied(effect, ranking) if r.effect.name != effect.name]
+    names = [p.name for e in others if isinstance(e, ChangedDevice) for p in e.parameters]
+    return tuple(dict.fromkeys(names))
+
+
+def _tied(effect: Effect, ranking: Sequence[Rival]) -> list[Rival]:
+    """Candidates that the recordings do not distinguish from an effect."""
     own = next((r for r in ranking if r.effect.name == effect.name), None)
-    words = [effect.word]
-    if own is not None:
-        for rival in ranking:
-            close = 0.5 * (own.gain - rival.gain) < TIED
-            # Where other laws count, they may hide a tie of the laws that are known.
-            close = close or 0.5 * abs(own.gain + own.law - rival.gain - rival.law) < TIED
-            if close or (_cosine(own, rival) > ALIKE and own.gain - rival.gain < 4 * TIED):
-                words.append(rival.word)
-    return tuple(dict.fromkeys(words))
+    if own is None:
+        return []
+    out = []
+    for rival in ranking:
+        close = 0.5 * (own.gain - rival.gain) < TIED
+        # Where other laws count, they may hide a tie of the laws that are known.
+        close = close or 0.5 * abs(own.gain + own.law - rival.gain - rival.law) < TIED
+        if close or (_cosine(own, rival) > ALIKE and own.gain - rival.gain < 4 * TIED):
+            out.append(rival)
+    return out
 
 
 def _cosine(one: Rival, other: Rival) -> float:

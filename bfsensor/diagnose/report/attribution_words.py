@@ -65,6 +65,8 @@ def _effect(found: Found) -> dict[str, Any]:
         told["law"] = law[0]
     told["gain_chi2"] = found.gain
     told["tied"] = list(found.tied)
+    if found.alike:
+        told["tied_quantities"] = list(found.alike)
     told["source"] = found.effect.source
     return told
 
@@ -156,6 +158,8 @@ def _said_effect(found: Found, verb: str) -> str:
     others = [w for w in found.tied if w != word]
     if others:
         text += f"; these recordings do not distinguish it from {' or '.join(others)}"
+    if found.alike:
+        text += f"; another value of {' or '.join(map(describe, found.alike))} does as well"
     return text
 
 

@@ -180,6 +180,8 @@ def headline(found: Found) -> str:
         (name, value), (known,) = next(iter(values.items())), found.effect.parameters
         unit = "" if known.unit == UNKNOWN_UNIT else f" {known.unit}"
         text = f"{describe(name)} of the device is {value}{unit}, nominally {known.neutral:.4g}{unit}"
+        if found.alike:
+            text += f", or {' or '.join(map(describe, found.alike))} differs"
         piece = PIECE_WORDS.get(found.effect.variant, "")
         return f"{piece}: {text}" if piece else text
     for text in HEADLINES.get(word, ()):

@@ -8,9 +8,13 @@ import pytest
 
 from bfsensor import Device
 from bfsensor.diagnose.data.channels import PER_ELECTRON
+from bfsensor.diagnose.detect.candidate_screen import Rival
+from bfsensor.diagnose.explain.attribution import Found, tied_quantities
 from bfsensor.diagnose.explain.solved_again import MOST_SOLVED, WORSE, Resolver
 from bfsensor.diagnose.model.device_solver import PHASES, DeviceSolver
+from bfsensor.diagnose.report.headlines import headline
 from bfsensor.effects.changed_device import Moved, Quantity, Solution
+from bfsensor.effects.charge_loss import ChargeLoss
 from bfsensor.effects.device_parameter import device_parameters
 from bfsensor.effects.effect import Layout, Parameter, Shot
 from bfsensor.effects.family import TemplateFamily
@@ -196,6 +200,29 @@ def test_values_beyond_what_a_device_can_have_are_not_fitted():
     assert [s["silicon.thickness"] for s in kind.starts(LAYOUT)] == pytest.approx(
         [NOMINAL + 0.5 * 48**0.5, NOMINAL - 1.5]
     )
+
+
+def test_another_quantity_that_does_as_well_is_named_beside_it():
+    kind = family()
+    (named,) = device_parameters(
+        {OTHER: {KEY: shape(1e-7)}}, {OTHER: 0.1}, {OTHER: 1.0}, units={OTHER: "um"},
+        bounds={OTHER: (-1.0, 8.0)},
+    )  # fmt: skip
+    own = Rival(kind({"silicon.thickness": 3.0}), 40.0, 15.0, np.array([1.0, 0.0]))
+    close = Rival(named({OTHER: 1.5}), 39.0, 14.0, np.array([0.9, 0.1]))
+    loss = Rival(ChargeLoss({"q": 1e-7}), 39.0, 14.0, np.array([0.9, 0.1]))
+    assert tied_quantities(own.effect, [own, close, loss]) == (OTHER,)
+    assert tied_quantities(own.effect, [own, replace(close, gain=20.0), loss]) == ()
+    assert tied_quantities(loss.effect, [loss, close]) == ()
+    found = Found(
+        own.effect,
+        40.0,
+        {"silicon.thickness": 0.1},
+        {},
+        ("device_parameter",),
+        (own, close),
+    )
+    assert headline(found).endswith("nominally 2 um, or field oxide differs")
 
 
 def test_a_solver_states_values_in_units_of_device_files():
