@@ -179,7 +179,9 @@ def headline(found: Found) -> str:
     if isinstance(found.effect, ChangedDevice):
         (name, value), (known,) = next(iter(values.items())), found.effect.parameters
         unit = "" if known.unit == UNKNOWN_UNIT else f" {known.unit}"
-        text = f"{describe(name)} of the device is {value}{unit}, nominally {known.neutral:.4g}{unit}"
+        number, *rest = value.split(" (")
+        value = " (".join([f"{number}{unit}", *rest])
+        text = f"{describe(name)} of the device is {value}, nominally {known.neutral:.4g}{unit}"
         if found.alike:
             text += f", or {' or '.join(map(describe, found.alike))} differs"
         piece = PIECE_WORDS.get(found.effect.variant, "")

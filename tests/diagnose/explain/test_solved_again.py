@@ -223,6 +223,8 @@ def test_another_quantity_that_does_as_well_is_named_beside_it():
         (own, close),
     )
     assert headline(found).endswith("nominally 2 um, or field oxide differs")
+    vague = replace(found, errors={"silicon.thickness": 4000.0})
+    assert "is 3 um (not constrained), nominally 2 um" in headline(vague)
 
 
 def test_a_solver_states_values_in_units_of_device_files():
