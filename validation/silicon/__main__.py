@@ -35,7 +35,7 @@ from bfsensor.device.parameters import change_parameter, device_parameters, para
 from bfsensor.device.quantities import quantities
 from bfsensor.errors import BFSensorError
 from bfsensor.response.edge_response import solve_response
-from validation.silicon.sealed_cases import committed_truth, diagnose_case, keep_rows
+from validation.silicon.sealed_cases import committed_truth, diagnose_case, holds, keep_rows
 from validation.silicon.truths import (
     BLUR,
     DOTS,
@@ -430,8 +430,7 @@ def score(name: str, case: str, truth: Mapping[str, Any], reports: Path) -> dict
     for quantity in truth["change"]:
         known = values.get(SHARES.get(quantity, quantity))
         if known is not None and "lo95" in known:
-            value = true_value(device, truth, quantity)
-            inside.append(bool(known["lo95"] <= value <= known["hi95"]))
+            inside.append(holds(known, true_value(device, truth, quantity)))
     classes = {class_of(q) for q in truth["change"]}
     # A signal that moves is no quantity, and is named by its class.
     moved = {CLASSES[q] for q in truth["change"] if q in MOVED}

@@ -41,7 +41,7 @@ from validation.concealed.readout import Context
 from validation.concealed.scene import Image, dithered_spots, spot_scene
 from validation.concealed.sensor import VirtualSensor
 from validation.silicon.__main__ import VOLTS, class_of, true_value
-from validation.silicon.sealed_cases import committed_truth, diagnose_case, keep_rows
+from validation.silicon.sealed_cases import committed_truth, diagnose_case, holds, keep_rows
 from validation.silicon.truths import CELLS, GATES, changed
 
 RESULTS = Path(__file__).parents[1] / "results" / "silicon_recordings.ecsv"
@@ -368,7 +368,7 @@ def score(name: str, case: str, truth: Mapping[str, Any], reports: Path) -> dict
     named = [next(iter(e["parameters"]), e["class"]) for e in report["effects"]]
     values = {k: v for e in report["effects"] for k, v in e["parameters"].items()}
     inside = [
-        bool(values[q]["lo95"] <= true_value(device, truth, q) <= values[q]["hi95"])
+        holds(values[q], true_value(device, truth, q))
         for q in truth["change"]
         if "lo95" in values.get(q, {})
     ]

@@ -8,7 +8,7 @@ import os
 import resource
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,20 @@ def committed_truth(path: Path, digest: str) -> dict[str, Any]:
         raise click.ClickException(f"{path} is not the truth that was committed to")
     truth: dict[str, Any] = json.loads(text)
     return truth
+
+
+def holds(told: Mapping[str, Any], value: float) -> bool:
+    """Whether a parameter's 95 % interval in report.json holds a value; open ends have no limit.
+
+    Examples
+    --------
+    >>> holds({"lo95": 1.0, "hi95": 2.0}, 2.5), holds({"lo95": 1.0, "hi95": 2.0, "open95": ["hi"]}, 2.5)
+    (False, True)
+    """
+    open_ = told.get("open95", ())
+    return ("lo" in open_ or told["lo95"] <= value) and (
+        "hi" in open_ or value <= told["hi95"]
+    )
 
 
 def keep_rows(rows: list[dict[str, Any]], results: Path, command: str, name: str) -> None:

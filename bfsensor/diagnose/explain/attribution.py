@@ -14,6 +14,7 @@ from bfsensor.diagnose.detect.candidates import candidates_of, tellable
 from bfsensor.diagnose.detect.locate import ALARM, Mismatch
 from bfsensor.diagnose.detect.model_error import charge
 from bfsensor.diagnose.explain.nonparametric import OpenWorld
+from bfsensor.diagnose.explain.solved_again import last_solved
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
 from bfsensor.diagnose.fit.likelihood_profile import Profile, linear_interval
 from bfsensor.diagnose.model.predictor import Predictor
@@ -121,8 +122,10 @@ class Found:
         ``scale**2`` (68 %) or ``(1.96 * scale)**2`` (95 %).  'open68' and 'open95' list the ends, 'lo'
         or 'hi', at which the chi-square does not rise that far within the range of fits;
         'stopped68' and 'stopped95' list those of them inside the range, where no prediction could
-        be made beyond, or the profile became flat.  All other parameters have the intervals
-        of :func:`~bfsensor.diagnose.fit.likelihood_profile.linear_interval`.
+        be made beyond, or the profile became flat.  A quantity of the device whose value is extrapolated
+        from the last one that could be solved has an interval from there, open beyond.  All other
+        parameters have the intervals of
+        :func:`~bfsensor.diagnose.fit.likelihood_profile.linear_interval`.
 
         Returns
         -------
@@ -143,6 +146,12 @@ class Found:
     def _interval(self, p: Parameter, level: str, width: float) -> dict[str, Any]:
         """Ends of one interval, with the keys 'open..' and 'stopped..' where an end is not reached."""
         keys = f"lo{level}", f"hi{level}"
+        solved = last_solved(self.effect)
+        if solved is not None:
+            value = self.effect[p.name]
+            out = "lo" if value < solved else "hi"
+            both = dict(zip(keys, sorted((value, solved)), strict=True))
+            return {**both, f"open{level}": [out], f"stopped{level}": [out]}
         if p.name not in self.profiles:
             ends = linear_interval(self.effect[p.name], width * self.errors[p.name], p)
             return dict(zip(keys, ends, strict=True))

@@ -91,7 +91,7 @@ class Resolver:
         """
         for _ in range(MOST_SOLVED):
             effect = model.effects[n]
-            if not self.acts(effect) or self._is_near(effect):
+            if not self.acts(effect) or _is_near(effect):
                 break
             if self.spent > SECONDS:
                 self._note(
@@ -128,26 +128,12 @@ class Resolver:
 
     def _note_far(self, effect: Effect) -> None:
         """Note a fitted value that is far from where the device was solved."""
-        if (
-            self.acts(effect)
-            and effect.solved_beside is not None
-            and not self._is_near(effect)
-        ):
+        if self.acts(effect) and (solved := last_solved(effect)) is not None:
             own: Quantity = effect.template
-            assert own.solved is not None
             self._note(
                 f"{effect.name}: the fitted value {own.nominal + effect.by:.3g} is extrapolated from a "
-                f"solution at {own.solved.value:.3g}"
+                f"solution at {solved:.3g}"
             )
-
-    def _is_near(self, effect: ChangedDevice) -> bool:
-        own: Quantity = effect.template
-        if effect.by == 0.0:
-            return True
-        if own.solved is None or own.solved.pulls is None:
-            return False
-        value = own.nominal + effect.by
-        return abs(value - own.solved.value) <= NEAR * abs(effect.by)
 
     def _solved(
         self, model: Model, n: int, cells: int, *, levels: bool
@@ -230,6 +216,26 @@ class Resolver:
     def _note(self, text: str) -> None:
         if text not in self.notes:
             self.notes.append(text)
+
+
+def last_solved(effect: Effect) -> float | None:
+    """Value that the device was solved at, where the fitted value is extrapolated from it; else None."""
+    if not isinstance(effect, ChangedDevice) or effect.template.name == PHASES:
+        return None
+    if effect.solved_beside is None or _is_near(effect):
+        return None
+    return float(effect.template.solved.value)
+
+
+def _is_near(effect: ChangedDevice) -> bool:
+    """Whether the device was solved at a quantity's fitted value, or so near that it serves for it."""
+    own: Quantity = effect.template
+    if effect.by == 0.0:
+        return True
+    if own.solved is None or own.solved.pulls is None:
+        return False
+    value = own.nominal + effect.by
+    return abs(value - own.solved.value) <= NEAR * abs(effect.by)
 
 
 def _with(model: Model, n: int, effect: Effect) -> Model:

@@ -227,6 +227,21 @@ def test_another_quantity_that_does_as_well_is_named_beside_it():
     assert "is 3 um (not constrained), nominally 2 um" in headline(vague)
 
 
+def test_a_value_beyond_the_last_that_could_be_solved_has_an_open_interval():
+    def found(value, pulls):
+        solved = Solution(4.0, Moved(((KEY, shape(response(4.0))),)), pulls)
+        effect = family(solved=solved)({"silicon.thickness": value})
+        return Found(effect, 40.0, {"silicon.thickness": 0.1}, {}, ("device_parameter",))
+
+    told = found(5.0, {}).intervals()["silicon.thickness"]
+    assert (told["lo95"], told["hi95"]) == (4.0, 5.0)
+    assert told["open95"] == told["stopped95"] == ["hi"]
+    assert "is more than 4 um" in headline(found(5.0, {}))
+    # Near the solution, and where the candidate was never solved at a fitted value, errors stand.
+    for near in (found(4.1, {}), found(5.0, None)):
+        assert "open95" not in near.intervals()["silicon.thickness"]
+
+
 def test_a_solver_states_values_in_units_of_device_files():
     device = Device.load("itl_sta3800c")
     solver = DeviceSolver(device.to_toml(), (-50.0,), (620.0,), True, True)
