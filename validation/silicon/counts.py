@@ -15,8 +15,9 @@ Hits = tuple[int, int]
 """Cases for which something holds, and cases of which it is asked."""
 
 RESULTS = "silicon_cases"
-NEWEST = ("proof7", "proof8", "proof9")
-"""Sets made after the diagnosis at a2ddae1 and, the last, at dffeb0b."""
+NEWEST = ("proof7", "proof8", "proof9", "proof10", "proof11", "proof12")
+"""Sets made after the diagnosis at a2ddae1 (two), dffeb0b, 8d13aae (two) and 9848899; the last three
+hold large changes alone, 'proof11' of another device."""
 VISIBLE = 8.0
 """Projected SNR from which a change is visible.  Chosen: the goal's; at 16 half as many cases count."""
 
