@@ -50,6 +50,8 @@ def test_joint_fits_decide_not_the_gain_of_the_screen(more, simple):
 
 def test_what_is_not_fitted():
     several = Rival(Settling({"alpha": 3e-3, "tau": 1.0}), GAIN, 0.0, np.ones(1))
-    assert asked(0.0, several, memory(0.4 * GAIN), memory(GAIN, select=-50.0, share=0.1)) == (False, 0)
+    assert asked(
+        0.0, several, memory(0.4 * GAIN), memory(GAIN, select=-50.0, share=0.1)
+    ) == (False, 0)
     # Another candidate is asked where the first cannot be fitted.
     assert asked(0.0, memory(GAIN, -3e-3), memory(GAIN)) == (True, 2)
