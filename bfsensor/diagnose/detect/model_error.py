@@ -65,9 +65,10 @@ def explained_by_word(before: BaselineFit, after: BaselineFit) -> dict[str, floa
     pulls = [
         fit.left[len(fit.residuals) : len(fit.left) - fit.scores] for fit in (before, after)
     ]
-    freed = (float(pulls[0] @ pulls[0]) - float(pulls[1] @ pulls[1])) / max(
-        sum(squares.values()), 1e-300
-    )
+    whole = sum(squares.values())
+    freed = float(pulls[0] @ pulls[0]) - float(pulls[1] @ pulls[1])
+    # Where no residual changed, the fits are the same.
+    freed = freed / whole if whole else 0.0
     return {
         word: max(old[word][0] - new[word][0] + freed * squares[word], 0.0)
         for word in words
