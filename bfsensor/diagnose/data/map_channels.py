@@ -20,7 +20,13 @@ from bfsensor.diagnose.data.channels import Channel, Common, join_common
 from bfsensor.diagnose.data.exposure_info import Axes, label_of
 from bfsensor.diagnose.data.map_borders import Border, find_borders
 from bfsensor.diagnose.data.map_noise import BlockNoise, block_noise
-from bfsensor.diagnose.data.map_texture import map_texture, texture_noise
+from bfsensor.diagnose.data.map_texture import (
+    SLOW,
+    map_texture,
+    slow_power,
+    slow_texture,
+    texture_noise,
+)
 from bfsensor.diagnose.data.map_waves import find_patterns, without_shape, without_steps
 from bfsensor.typing import FloatArray
 
@@ -175,6 +181,7 @@ class MapChannels:
         modes = rfft2(noise)
         group.power += spectrum_rings(modes, self._shape) / part
         group.long += long_power(modes, self._shape) / part
+        group.slow = group.slow + slow_power(noise, modes) / part
         group.pairs += 1
         group.shared += shared
         group.level += level
@@ -313,6 +320,9 @@ class MapChannels:
         power = sum(
             w**2 * g.power / (2 * g.pairs**2) for w, g in zip(weights, groups, strict=True)
         )
+        slow = sum(
+            w**2 * g.slow / (2 * g.pairs**2) for w, g in zip(weights, groups, strict=True)
+        )
         for border in find_borders(image):
             border.cut(image)
             self._keep(border)
@@ -328,7 +338,7 @@ class MapChannels:
         long = self._long(groups, weights)
         return _Map(
             image, float(low) + common, np.asarray(power) + common, float(ratio), pairs,
-            max(long - float(low), 0.0), float(wide),
+            max(long - float(low), 0.0), float(wide), np.asarray(slow),
         )  # fmt: skip
 
     def _long(self, groups: list[_MapGroup], weights: FloatArray) -> float:
@@ -411,9 +421,15 @@ class MapChannels:
             )
         )
         texture = map_texture(free, measured)
-        spread = texture_noise(free, texture, int(measured.sum()))
+        values, spread = texture.values, texture_noise(free, texture, int(measured.sum()))
+        if image.long:
+            # The ring next to the slow modes: in boxes, noise that is not white counts too.
+            flat = float(image.power[int(np.ceil(2 * RINGS * SLOW))])
+            mean, more = slow_texture(image.slow, flat, self._shape, texture, image.pairs)
+            spread = more + (spread if spread.ndim == 2 else np.diag(spread**2))
+            values = values - mean
         told = {"what": "texture", "k": -1.0, "x": texture.dx, "y": texture.dy}
-        out.append((texture.values, spread, told))
+        out.append((values, spread, told))
         chess, centres = map_chess(filled)
         # Noise of single pixels: that over many, divided by their ratio.
         error = np.sqrt(single**2 / image.ratio * len(chess) / max(good.sum(), 1))
@@ -439,6 +455,7 @@ class _MapGroup:
     high: float = 0.0
     long: float = 0.0
     power: FloatArray = field(default_factory=lambda: np.zeros(RINGS))
+    slow: FloatArray = field(default_factory=lambda: np.zeros(()))
     pairs: int = 0
     shared: float = 0.0
     level: float = 0.0
@@ -463,7 +480,8 @@ class _Map:
 
     ``ratio``: that variance over the one between neighbours.  The brighter-fatter effect smooths
     the response of single pixels as it does their noise, to first order.  ``long``: excess of the
-    noise in waves of several blocks.  ``wide``: noise over a block in units of ``low``.
+    noise in waves of several blocks.  ``wide``: noise over a block in units of ``low``.  ``slow``:
+    power of the noise by mode, of :func:`~bfsensor.diagnose.data.map_texture.slow_power`.
     """
 
     values: NDArray[np.float32]
@@ -473,6 +491,7 @@ class _Map:
     pairs: int
     long: float = 0.0
     wide: float = 1.0
+    slow: FloatArray = field(default_factory=lambda: np.zeros(()))
 
     def over(self, other: _Map) -> _Map:
         """Ratio of two maps, less one."""
@@ -481,6 +500,7 @@ class _Map:
             self.power + other.power, self.ratio, min(self.pairs, other.pairs),
             self.long + other.long,
             (self.wide * self.low + other.wide * other.low) / max(self.low + other.low, 1e-30),
+            self.slow + other.slow,
         )  # fmt: skip
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft, next_fast_len, rfft, rfft2
+from scipy.fft import fft, irfft, irfft2, next_fast_len, rfft, rfft2
 
+from bfsensor.diagnose.data.map_waves import smooth_shapes
 from bfsensor.typing import FloatArray
 
 NEAREST, FARTHEST = 4, 40
@@ -27,6 +29,12 @@ STRONGEST = 4096
 """Largest number of modes that count as a pattern's; weaker ones count as noise, which makes errors
 larger.  Chosen: with 8192, errors of maps with more modes are closer to the truth, at twice the
 memory and time."""
+
+SLOW = 0.1
+"""Highest frequency [cycles per pixel], along either axis, of noise that is not white.  Chosen: light
+that fluctuates with a Gaussian correlation over 10 pixels, the shortest length of
+:class:`~bfsensor.effects.illumination_turbulence.IlluminationTurbulence`, has 3e-9 of its largest power
+there; with 0.2, four times as many modes of white noise count."""
 
 
 class Texture(NamedTuple):
@@ -162,3 +170,108 @@ def texture_noise(image: NDArray, texture: Texture, pixels: int) -> FloatArray:
     spread = 2 * np.sqrt(own * strength) * np.cos(2 * np.pi * turns)
     spread *= (1e6 / np.sqrt(products))[:, None]
     return np.asarray(spread @ spread.T + np.diag((1e6 * own) ** 2 / products))
+
+
+def slow_power(noise: NDArray, modes: NDArray) -> FloatArray:
+    """Power of the modes of a map's noise up to :data:`SLOW`, without the map's smooth shape.
+
+    Parameters
+    ----------
+    noise : ndarray, shape (ny, nx)
+        Noise of a map.
+    modes : ndarray, shape (ny, nx // 2 + 1)
+        ``scipy.fft.rfft2`` of it.
+
+    Returns
+    -------
+    power : ndarray, shape (rows, columns)
+        That of white noise is a pixel's variance; 0 for modes of row or column means.
+
+    Examples
+    --------
+    >>> noise = np.random.default_rng(1).standard_normal((128, 128))
+    >>> slow_power(noise, rfft2(noise)).shape
+    (25, 13)
+    """
+    ny, nx = noise.shape
+    rows, columns = _slow(ny), np.s_[: int(SLOW * nx) + 1]
+    q_y, q_x = (smooth_shapes(n).astype(noise.dtype, copy=False) for n in (ny, nx))
+    smooth = q_y.T @ noise @ q_x
+    rough = modes[rows, columns] - _spectra(ny)[rows] @ smooth @ _spectra(nx)[columns].T
+    power = np.asarray(rough.real**2 + rough.imag**2, float) / (ny * nx)
+    power[rows == 0], power[:, 0] = 0.0, 0.0
+    return power
+
+
+def slow_texture(
+    power: FloatArray, white: float, shape: tuple[int, int], texture: Texture, pairs: int
+) -> tuple[FloatArray, FloatArray]:
+    r"""Texture of noise that is not white, and its covariance.
+
+    Noise whose modes k have the power P gives a map the texture :math:`T_d` with
+
+    .. math::
+        \langle T_d \rangle = \frac{1}{N} \sum_k P_k \cos(k \cdot d), \quad
+        \mathrm{cov}(T_d, T_{d'}) = \frac{2}{N^2} \sum_k P_k^2 \cos(k \cdot d) \cos(k \cdot d').
+
+    P is known from differences of pairs of flats, so that the mean has an error of its own, the
+    covariance over the number of pairs.
+
+    Parameters
+    ----------
+    power : ndarray, shape (rows, columns)
+        Power of the map's noise by :func:`slow_power`, a mean over pairs.
+    white : float
+        Part of it that is white, whose errors :func:`texture_noise` has.
+    shape : (int, int)
+        Shape (ny, nx) of the map.
+    texture : Texture
+        Autocovariance of the map.
+    pairs : int
+        Number of pairs.
+
+    Returns
+    -------
+    values : ndarray, shape (n,)
+        Mean [1e-6].
+    covariance : ndarray, shape (n, n)
+        Covariance of a texture less this mean [1e-12].
+
+    Examples
+    --------
+    >>> noise = np.random.default_rng(1).standard_normal((128, 128))
+    >>> texture = map_texture(noise)
+    >>> power = slow_power(noise, rfft2(noise))
+    >>> values, covariance = slow_texture(power, 1.0, noise.shape, texture, 1)
+    >>> bool((np.sqrt(np.diag(covariance)) < texture_noise(noise, texture, 128**2)).all())
+    True
+    """
+    ny, nx = shape
+    row = _slow(ny)
+    dx, dy = texture.dx.astype(int), texture.dy.astype(int)
+    whole = np.zeros((2, ny, nx // 2 + 1))
+    whole[0][row, : power.shape[1]] = np.where(power > 0, power - white, 0.0)
+    # The mean square of a mean of exponential powers is 1 + 1 / n times the square of their mean.
+    square = power**2 * pairs / (pairs + 1)
+    whole[1][row, : power.shape[1]] = np.where(
+        power > 0, np.maximum(square - white**2, 0.0), 0.0
+    )
+    mean, spread = irfft2(whole, s=(ny, nx))
+    # Products that a transform joins across the border are those of pixels far apart, which are 0.
+    values = 1e6 * mean[dy % ny, dx % nx] * nx / (nx - np.abs(dx))
+    less, more = (
+        spread[(dy[:, None] + s * dy) % ny, (dx[:, None] + s * dx) % nx] for s in (-1, 1)
+    )
+    return values, 1e12 * (1 + 1 / pairs) * (less + more) / (ny * nx)
+
+
+def _slow(n: int) -> NDArray[np.int64]:
+    """Indices of the modes of a side of n pixels up to :data:`SLOW`."""
+    last = int(SLOW * n)
+    return np.arange(-last, last + 1) % n if last else np.zeros(1, int)
+
+
+@lru_cache(maxsize=8)
+def _spectra(n: int) -> NDArray[Any]:
+    """Transform of the smooth shapes along a side of n pixels."""
+    return np.asarray(fft(smooth_shapes(n), axis=0))
