@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from astropy.table import Row, Table
 
+from validation.challenge.quoted import RAW_FRAMES
 from validation.concealed.goals import QUOTED, quoted_goal
 from validation.correction.quoted import CORRECTED
 from validation.index import Age, read_ages, read_claims
@@ -514,6 +515,7 @@ def _numbers() -> dict[str, Callable[[Rows], str]]:
     numbers.update(CORRECTED)
     numbers.update(SILICON_PIECES)
     numbers.update(SILICON_CASES)
+    numbers.update(RAW_FRAMES)
     for short in QUOTED:
         numbers[f"independent {short}"] = lambda r, s=short: quoted_goal(
             r("independent_goals"), s

@@ -15,9 +15,9 @@ Hits = tuple[int, int]
 """Cases for which something holds, and cases of which it is asked."""
 
 RESULTS = "silicon_cases"
-NEWEST = ("proof7", "proof8", "proof9", "proof10", "proof11", "proof12")
-"""Sets made after the diagnosis at a2ddae1 (two), dffeb0b, 8d13aae (two) and 9848899; the last three
-hold large changes alone, 'proof11' of another device."""
+NEWEST = tuple(f"proof{n}" for n in range(7, 15))
+"""Sets made after the diagnosis at a2ddae1 (two), dffeb0b, 8d13aae (two), 9848899 and 5b559fd (two); the
+last five hold large changes alone, 'proof11' and 'proof14' of another device."""
 VISIBLE = 8.0
 """Projected SNR from which a change is visible.  Chosen: the goal's; at 16 half as many cases count."""
 
@@ -60,6 +60,10 @@ def count(table: Table) -> Mapping[str, Hits]:
     }
 
 
+def _by_engine(table: Table, engine: str) -> Mapping[str, Hits]:
+    return count(table[table["engine"] == engine])
+
+
 def _true(table: Table, name: str) -> np.ndarray:
     return np.asarray(table[name], dtype=bool)
 
@@ -79,6 +83,9 @@ def said(hits: Hits) -> str:
 SILICON_CASES: dict[str, Callable[[Rows], str]] = {
     f"silicon {name}": lambda r, n=name: said(count(of_sets(r))[n])
     for name in ("alarms", "detected", "class", "first", "values")
+} | {
+    f"silicon class {short}": lambda r, e=engine: said(_by_engine(of_sets(r), e)["class"])
+    for short, engine in (("solver", "poisson"), ("images", "image charge"))
 } | {
     "silicon seconds": lambda r: f"{np.median(of_sets(r)['cpu_s']):.0f}",
     "silicon slowest": lambda r: f"{np.max(of_sets(r)['cpu_s']):.0f}",
