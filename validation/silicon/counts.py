@@ -80,14 +80,20 @@ def said(hits: Hits) -> str:
     return f"{hits[0]} of {hits[1]} ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
-SILICON_CASES: dict[str, Callable[[Rows], str]] = {
-    f"silicon {name}": lambda r, n=name: said(count(of_sets(r))[n])
-    for name in ("alarms", "detected", "class", "first", "values")
-} | {
-    f"silicon class {short}": lambda r, e=engine: said(_by_engine(of_sets(r), e)["class"])
-    for short, engine in (("solver", "poisson"), ("images", "image charge"))
-} | {
-    "silicon seconds": lambda r: f"{np.median(of_sets(r)['cpu_s']):.0f}",
-    "silicon slowest": lambda r: f"{np.max(of_sets(r)['cpu_s']):.0f}",
-}
+SILICON_CASES: dict[str, Callable[[Rows], str]] = (
+    {
+        f"silicon {name}": lambda r, n=name: said(count(of_sets(r))[n])
+        for name in ("alarms", "detected", "class", "first", "values")
+    }
+    | {
+        f"silicon class {short}": lambda r, e=engine: said(
+            _by_engine(of_sets(r), e)["class"]
+        )
+        for short, engine in (("solver", "poisson"), ("images", "image charge"))
+    }
+    | {
+        "silicon seconds": lambda r: f"{np.median(of_sets(r)['cpu_s']):.0f}",
+        "silicon slowest": lambda r: f"{np.max(of_sets(r)['cpu_s']):.0f}",
+    }
+)
 """Numbers by name, as functions of the results."""
