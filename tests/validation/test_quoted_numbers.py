@@ -104,6 +104,7 @@ KEYS = {
 BY_TEXT = {
     "trial sets", "derivatives itl", "derivatives e2v", "iteration",
     *(f"flats left e2v {lag}" for lag in ("00", "10", "01")),
+    *(f"{word} {name}" for word in ("fresh", "frozen") for name in ("alarms", "named", "values")),
 }  # fmt: skip
 """Numbers of rows, of a column of text or of arrays in rows, which factors on floats do not reach."""
 
