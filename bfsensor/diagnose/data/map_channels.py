@@ -338,7 +338,7 @@ class MapChannels:
         long = self._long(groups, weights)
         return _Map(
             image, float(low) + common, np.asarray(power) + common, float(ratio), pairs,
-            max(long - float(low), 0.0), float(wide), np.asarray(slow),
+            max(long - float(low), 0.0), float(wide), np.where(slow > 0, slow + common, 0.0),
         )  # fmt: skip
 
     def _long(self, groups: list[_MapGroup], weights: FloatArray) -> float:
