@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import fft, irfft, irfft2, next_fast_len, rfft, rfft2
+from scipy.fft import fft, irfft, next_fast_len, rfft, rfft2
 
 from bfsensor.diagnose.data.map_waves import smooth_shapes
 from bfsensor.typing import FloatArray
@@ -247,22 +247,33 @@ def slow_texture(
     True
     """
     ny, nx = shape
-    row = _slow(ny)
     dx, dy = texture.dx.astype(int), texture.dy.astype(int)
-    whole = np.zeros((2, ny, nx // 2 + 1))
-    whole[0][row, : power.shape[1]] = np.where(power > 0, power - white, 0.0)
+    there = power > 0
     # The mean square of a mean of exponential powers is 1 + 1 / n times the square of their mean.
-    square = power**2 * pairs / (pairs + 1)
-    whole[1][row, : power.shape[1]] = np.where(
-        power > 0, np.maximum(square - white**2, 0.0), 0.0
-    )
-    mean, spread = irfft2(whole, s=(ny, nx))
+    square = np.maximum(power**2 * pairs / (pairs + 1) - white**2, 0.0)
     # Products that a transform joins across the border are those of pixels far apart, which are 0.
-    values = 1e6 * mean[dy % ny, dx % nx] * nx / (nx - np.abs(dx))
+    values = 1e6 * _cosines(np.where(there, power - white, 0.0), shape, dx, dy)
+    values *= nx / (nx - np.abs(dx))
     less, more = (
-        spread[(dy[:, None] + s * dy) % ny, (dx[:, None] + s * dx) % nx] for s in (-1, 1)
+        _cosines(
+            np.where(there, square, 0.0), shape, dx[:, None] + s * dx, dy[:, None] + s * dy
+        )
+        for s in (-1, 1)
     )
     return values, 1e12 * (1 + 1 / pairs) * (less + more) / (ny * nx)
+
+
+def _cosines(
+    power: FloatArray, shape: tuple[int, int], dx: NDArray[np.int64], dy: NDArray[np.int64]
+) -> FloatArray:
+    """Sum of power times cos(k d) over slow modes and their conjugates, over the pixels, by shift d."""
+    ny, nx = shape
+    x, y = np.arange(dx.min(), dx.max() + 1), np.arange(dy.min(), dy.max() + 1)
+    along_y = np.exp(2j * np.pi / ny * np.outer(y, _slow(ny)))
+    along_x = np.exp(2j * np.pi / nx * np.outer(np.arange(power.shape[1]), x))
+    # Modes whose conjugates are in the transform themselves, those of column means, are 0.
+    whole = 2 * (along_y @ power @ along_x).real / (ny * nx)
+    return np.asarray(whole[dy - y[0], dx - x[0]])
 
 
 def _slow(n: int) -> NDArray[np.int64]:
