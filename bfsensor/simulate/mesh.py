@@ -6,7 +6,9 @@ channel-stop edges, oxide and silicon surfaces, and halving every interval keeps
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -60,6 +62,15 @@ _BARRIER_WEIGHT = 1.6
 
 Chosen: at twice the value up to twice as many cells lie under the barrier, and those under the
 collecting gates are wider for it, as the number of cells is fixed."""
+
+
+LEAST = 0.02
+"""Least length of the parts of a pixel [um]: edges in x or y that are nearer to one another share a
+node, and those that are nearer to the pixel's centre or side have a node at this distance from it.
+
+Measured (itl_sta3800c, 16 cells, a channel stop that becomes narrower): with a part of 0.01 um linear
+systems take twice as many iterations, with 0.00005 um 23 times as many, and a_10 is 18 % off.  Twice as
+long, nodes may lie 0.04 um from an edge, an eighth of its uncertainty."""
 
 
 @dataclass(frozen=True)
@@ -234,6 +245,39 @@ def make_mesh(
     return Mesh(axes[0], axes[1], _z_nodes(device, refine_z), side, side, pitch, cells)
 
 
+def part_ends(inner: Sequence[float], end: float, least: float = LEAST) -> list[int]:
+    """Numbers of the edges between 0 and ``end`` that have a node of their own, ascending.
+
+    Those nearer than ``least`` to one that is listed before have none.
+
+    Examples
+    --------
+    >>> part_ends([3.9, 3.0, 3.91, 6.0], 5.0)
+    [1, 0]
+    """
+    kept: list[int] = []
+    for n, point in enumerate(inner):
+        if 0.0 < point < end and all(abs(point - inner[k]) >= least for k in kept):
+            kept.append(n)
+    return sorted(kept, key=lambda n: inner[n])
+
+
+def parted(points: Sequence[float], least: float = LEAST) -> FloatArray:
+    """Ascending points, the inner ones moved so far that none is nearer than ``least`` to the next.
+
+    Examples
+    --------
+    >>> parted([0.0, 3.9, 4.9999, 5.0]).tolist()
+    [0.0, 3.9, 4.98, 5.0]
+    """
+    out = np.array(points, dtype=float)
+    for n in range(len(out) - 2, 0, -1):
+        out[n] = min(out[n], out[n + 1] - least)
+    for n in range(1, len(out) - 1):
+        out[n] = max(out[n], out[n - 1] + least)
+    return out
+
+
 def _segments(device: Device, axis: int) -> list[tuple[float, float]]:
     """Ends of the parts of half a pixel [um from its centre], each with its mesh weight.
 
@@ -255,12 +299,11 @@ def _segments(device: Device, axis: int) -> list[tuple[float, float]]:
         if stop.dots is not None:
             offset = abs(stop.dots.centre - half)
             points += [abs(offset - stop.dots.height / 2), offset + stop.dots.height / 2]
-    inside = sorted(p for p in set(np.round(points, 9)) if 1e-6 < p < half - 1e-6)
-    ends = [*inside, half]
-    starts = [0.0, *inside]
+    points = [float(p) for p in np.round(points, 9)]
+    nodes = parted([0.0, *(points[n] for n in part_ends(points, half)), half])
     return [
-        (end, weight if start >= fine_from - 1e-6 else 1.0)
-        for start, end in zip(starts, ends, strict=True)
+        (float(end), weight if start >= fine_from - 1e-6 else 1.0)
+        for start, end in pairwise(nodes)
     ]
 
 

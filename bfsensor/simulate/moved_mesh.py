@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bfsensor.errors import DeviceError
-from bfsensor.simulate.mesh import FINE_ABOVE, Mesh, Surfaces
+from bfsensor.simulate.mesh import FINE_ABOVE, LEAST, Mesh, Surfaces, part_ends, parted
 from bfsensor.typing import FloatArray
 
 if TYPE_CHECKING:
     from bfsensor.device.device import Device
 
 _SAME = 1e-6
-"""Distance below which two surfaces or edges count as one [um].
+"""Distance below which two surfaces count as one [um].
 
 Chosen: far above round-off and below any interval of a mesh; twice as large changes nothing."""
 
@@ -70,23 +70,23 @@ def move_mesh(mesh: Mesh, device: Device, moved: Device) -> Mesh:
         here, there = (_in_pixel(d, axis) for d in (device, moved))
         centre = pitch * np.round(old / pitch)
         offset = old - centre
-        shifted = _follow(np.abs(offset), here, there, moved, "xy"[axis])
+        shifted = _follow(np.abs(offset), here, there, moved, "xy"[axis], LEAST)
         nodes.append(
             np.where(shifted == np.abs(offset), old, centre + np.sign(offset) * shifted)
         )
-    z = _follow(mesh.z, _heights(device), _heights(moved), moved, "z")
+    z = _follow(mesh.z, _heights(device), _heights(moved), moved, "z", _SAME)
     z[-1] = moved.silicon.thickness
     return replace(mesh, x=nodes[0], y=nodes[1], z=z)
 
 
 def _in_pixel(device: Device, axis: int) -> list[float]:
-    """Distances from the pixel's centre [um] of the edges of gates, stops, tapers and dots."""
+    """Distances from the pixel's centre [um] of stops, tapers, gates, dots and, last, of its side."""
     half = (device.pixel.pitch_x, device.pixel.pitch_y)[axis] / 2
     stop = device.channel_stop
     if axis == 0:
         edge = half - stop.width / 2
-        return [0.0, edge, edge - device.gates.field_oxide_taper, half]
-    points = [0.0, max(device.gates.edges_y(device.pixel.pitch_y))]
+        return [edge, edge - device.gates.field_oxide_taper, half]
+    points = [max(device.gates.edges_y(device.pixel.pitch_y))]
     if stop.dots is not None:
         offset = abs(stop.dots.centre - half)
         points += [abs(offset - stop.dots.height / 2), offset + stop.dots.height / 2]
@@ -98,7 +98,7 @@ def _heights(device: Device) -> list[float]:
     surfaces = Surfaces.of(device)
     top = max(surfaces.silicon_channel, surfaces.silicon_stop)
     return [
-        0.0, surfaces.gate_channel, surfaces.silicon_channel, surfaces.silicon_stop,
+        surfaces.gate_channel, surfaces.silicon_channel, surfaces.silicon_stop,
         top + FINE_ABOVE, device.silicon.thickness,
     ]  # fmt: skip
 
@@ -109,19 +109,19 @@ def _follow(
     there: list[float],
     moved: Device,
     axis: str,
+    least: float,
 ) -> FloatArray:
-    """Positions of nodes when points go from ``here`` to ``there``, linear between them."""
-    order = sorted(range(len(here)), key=lambda n: here[n])
-    kept: list[int] = []
-    for n in order:
-        # Where two points coincide, nodes follow the one that is listed first; the other then
-        # lies between nodes of the moved mesh.
-        if not kept or here[n] - here[kept[-1]] > _SAME:
-            kept.append(n)
-    old, new = np.array(here)[kept], np.array(there)[kept]
+    """Positions of nodes when points go from ``here`` to ``there``, linear between them and 0.
+
+    The last point is the end.  Of others nearer to one another than ``least`` nodes follow the one
+    that is listed first.
+    """
+    kept = part_ends(here[:-1], here[-1], least)
+    old, new = ([0.0, *(p[n] for n in kept), p[-1]] for p in (here, there))
     if np.any(np.diff(new) <= 0):
         raise DeviceError(
             f"{moved.name}: along {axis} surfaces or edges at {np.round(new, 4).tolist()} um are not in "
             f"the order of those at {np.round(old, 4).tolist()} um that the mesh was laid for"
         )
-    return nodes + np.interp(nodes, old, new - old)
+    laid = parted(old, least)
+    return nodes + np.interp(nodes, laid, parted(new, least) - laid)
