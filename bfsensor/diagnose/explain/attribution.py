@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from bfsensor.diagnose.detect.candidate_screen import Rival
 from bfsensor.diagnose.detect.candidates import candidates_of, tellable
 from bfsensor.diagnose.detect.locate import ALARM, Mismatch
-from bfsensor.diagnose.detect.model_error import charge
+from bfsensor.diagnose.detect.model_error import SAME, charge
 from bfsensor.diagnose.explain.nonparametric import OpenWorld
 from bfsensor.diagnose.explain.solved_again import last_solved
 from bfsensor.diagnose.fit.baseline_fit import BaselineFit
@@ -114,6 +114,21 @@ class Found:
     def alike(self) -> tuple[str, ...]:
         """Other quantities of the device that these recordings do not distinguish from it."""
         return tied_quantities(self.effect, self.rivals)
+
+    @property
+    def quantity(self) -> Rival | None:
+        """Quantity of the device that does best in place of a law of the boundary shifts.
+
+        A device says why shifts differ, a law only how, so that the quantity may be the cause where the
+        simulation's response to it is wrong.  None where the device's class is tied, or where its change
+        is nearer to nothing than to the law's.
+        """
+        law = self.effect.stage == "collect" and "flat_cov" in self.effect.touches
+        devices = [r for r in self.rivals if isinstance(r.effect, ChangedDevice)]
+        if not law or not devices or any(r.word in self.tied for r in devices):
+            return None
+        best = max(devices, key=lambda r: r.gain)
+        return best if best.gain >= SAME**2 * self.gain else None
 
     def intervals(self) -> dict[str, dict[str, Any]]:
         """Values with intervals of 68 and 95 %, as report.json has them.

@@ -16,6 +16,7 @@ from bfsensor.diagnose.report.class_words import (
     PIECE_WORDS,
     said_family_p,
     said_interval,
+    said_number,
     said_p,
     said_value,
 )
@@ -87,6 +88,7 @@ def said_of(attribution: Attribution) -> list[str]:
             )
             continue
         out.append(f"{_said_effect(found, verb)}.")
+        out += _said_quantity(found)
     out += _said_shares(attribution)
     if attribution.found and attribution.free_form is None:
         out.append(_said_left(attribution))
@@ -161,6 +163,22 @@ def _said_effect(found: Found, verb: str) -> str:
     if found.alike:
         text += f"; another value of {' or '.join(map(describe, found.alike))} does as well"
     return text
+
+
+def _said_quantity(found: Found) -> list[str]:
+    """State which quantity of the device does best in place of a law of the boundary shifts."""
+    rival = found.quantity
+    if rival is None:
+        return []
+    (known,) = rival.effect.parameters
+    value, nominal, gain, whole = map(
+        said_number, (rival.effect[known.name], known.neutral, rival.gain, found.gain)
+    )
+    return [
+        f"Of the device's quantities {describe(known.name)} does best: at {value} {known.unit}, "
+        f"nominally {nominal}, it takes {gain} of {whole} in chi-square; it may be the cause if the "
+        "simulated response to it is wrong."
+    ]
 
 
 def _said_left(attribution: Attribution) -> str:

@@ -12,13 +12,16 @@ from bfsensor.diagnose.detect.candidate_screen import Rival
 from bfsensor.diagnose.explain.attribution import Found, tied_quantities
 from bfsensor.diagnose.explain.solved_again import MOST_SOLVED, WORSE, Resolver
 from bfsensor.diagnose.model.device_solver import PHASES, DeviceSolver
+from bfsensor.diagnose.report.attribution_words import _said_quantity
 from bfsensor.diagnose.report.headlines import headline
 from bfsensor.effects.changed_device import Moved, Quantity, Solution
 from bfsensor.effects.charge_loss import ChargeLoss
 from bfsensor.effects.device_parameter import device_parameters
 from bfsensor.effects.effect import Layout, Parameter, Shot
 from bfsensor.effects.family import TemplateFamily
+from bfsensor.effects.interpixel_coupling import InterpixelCoupling
 from bfsensor.effects.simulated_physics import SiliconPhysics
+from bfsensor.effects.voltage_dependence import VoltageDependence
 from bfsensor.errors import DeviceError
 
 KEY = (620.0, -50.0)
@@ -225,6 +228,32 @@ def test_another_quantity_that_does_as_well_is_named_beside_it():
     assert headline(found).endswith("nominally 2 um, or field oxide differs")
     vague = replace(found, errors={"silicon.thickness": 4000.0})
     assert "is 3 um (not constrained), nominally 2 um" in headline(vague)
+
+
+def test_the_quantity_that_does_best_stands_beside_a_law_of_the_shifts():
+    quantity = family()({"silicon.thickness": 3.0})
+    law, coupling = (
+        VoltageDependence({"delta": -0.05}),
+        InterpixelCoupling({"ax": 1e-3, "ay": 1e-3, "decay": 0.0}),
+    )
+    rival = Rival(quantity, 50.0, 20.0, np.array([0.7, 0.7]))
+
+    def found(effect, gain, tied=()):
+        own = Rival(effect, gain, 40.0, np.array([1.0, 0.0]))
+        return Found(effect, gain, {}, {}, (effect.word, *tied), (own, rival))
+
+    assert found(law, 100.0).quantity is rival
+    (said,) = _said_quantity(found(law, 100.0))
+    assert said.startswith(
+        "Of the device's quantities thickness does best: at 3 um, nominally 2, it takes 50 of 100"
+    )
+    assert "may be the cause" in said
+    # It is tied, is nearer to nothing than to the law, or what was found is no law of the shifts.
+    assert found(law, 100.0, ("device_parameter",)).quantity is None
+    assert found(law, 201.0).quantity is None
+    assert found(coupling, 100.0).quantity is None
+    assert found(quantity, 100.0).quantity is None
+    assert _said_quantity(found(coupling, 100.0)) == []
 
 
 def test_a_value_beyond_the_last_that_could_be_solved_has_an_open_interval():
