@@ -33,6 +33,9 @@ three times as long."""
 PHASES = "gates.collecting_phases"
 """Number of gates under which a pixel collects, which no device file states an uncertainty of."""
 
+OXIDES = "gates.gate_oxide", "gates.field_oxide"
+"""Quantities of which no device has the second below the first."""
+
 NONE: Mapping[str, float] = MappingProxyType({})
 """No quantities."""
 
@@ -117,9 +120,10 @@ class DeviceSolver:
         return end if inner == nominal else inner
 
     def _built(self, name: str, value: float) -> bool:
-        """Whether a device with a quantity at a value can be built."""
+        """Whether a device with a quantity at a value can be built, all others nominal."""
+        by = (value - self.nominal(name)) / quantities(self.device)[name].number(1.0)
         try:
-            self.device_with({name: value}, self.device.operating_point.back_bias)
+            change_parameter(self.device, name, by)
         except DeviceError:
             return False
         return True
@@ -153,10 +157,24 @@ class DeviceSolver:
         own = self.device.operating_point.back_bias
         here = change_parameter(self.device, "operating_point.back_bias", bias - own)
         known = quantities(self.device)
+        values = self._with_oxides(values)
         for name, value in values.items():
             by = (value - self.nominal(name)) / known[name].number(1.0)
             here = change_parameter(here, name, by)
         return here
+
+    def _with_oxides(self, values: Mapping[str, float]) -> Mapping[str, float]:
+        """Values with a field oxide at least as thick as the gate oxide, in an order that devices allow.
+
+        Of a sensor whose two oxides are one film a thicker gate oxide is a thicker field oxide, too.
+        """
+        if not {*OXIDES} & values.keys():
+            return values
+        gate, field = (values.get(name, self.nominal(name)) for name in OXIDES)
+        rest = {n: v for n, v in values.items() if n not in OXIDES}
+        both = dict(zip(OXIDES, (gate, max(gate, field)), strict=True))
+        order = OXIDES if gate <= self.nominal(OXIDES[0]) else OXIDES[::-1]
+        return {**{name: both[name] for name in order}, **rest}
 
     def moved(
         self,

@@ -27,3 +27,25 @@ def test_open_ends_and_limits_at_the_nominal_value_stay():
     assert np.isinf(solver("itl_sta3800c").range("channel.implant[0].dose")[1])
     # Both oxides of this device are 0.15 um thick, and the field oxide is not thinner.
     assert solver("e2v_ccd250").range("gates.gate_oxide")[1] == 5.0
+
+
+def test_a_field_oxide_is_at_least_as_thick_as_the_gate_oxide():
+    """Fits of e2v's two equal oxides ended where no device is, and a null was an alarm (p 2e-5)."""
+    own = solver("e2v_ccd250")
+    oxides = "gates.gate_oxide", "gates.field_oxide"
+    for given, wanted in (
+        ((0.16, 0.15), (0.16, 0.16)), ((0.145, 0.14), (0.145, 0.145)),
+        ((0.158, 0.145), (0.158, 0.158)), ((0.14, 0.16), (0.14, 0.16)),
+        ((0.16, 0.17), (0.16, 0.17)),
+    ):  # fmt: skip
+        for order in (1, -1):
+            values = dict(zip(oxides[::order], given[::order], strict=True))
+            device = own.device_with(values, -50.0)
+            assert (device.gates.gate_oxide, device.gates.field_oxide) == pytest.approx(
+                wanted
+            )
+    assert own.device_with({oxides[0]: 0.17}, -50.0).gates.field_oxide == pytest.approx(
+        0.17
+    )
+    # Its range ends at the gate oxide where the two are not one film.
+    assert solver("itl_sta3800c").range(oxides[1])[0] == pytest.approx(0.1)
