@@ -219,6 +219,20 @@ def test_half_of_the_cases_are_the_programs_and_change_what_it_has():
         cases.tables_of(device, own[0] | {"change": {}, "scatter": {}}, (-50.0,))
 
 
+def test_dots_are_outside_of_a_device_without_dots_alone():
+    def strange(name):
+        drawn = (
+            cases.draw_case(
+                np.random.default_rng([3, n]), Device.load(name), False, "poisson"
+            )
+            for n in range(100)
+        )
+        return {name for c in drawn if c["outside"] for name in c["change"]}
+
+    assert strange("itl_sta3800c") == set(cases.OUTSIDE)
+    assert strange("e2v_ccd250") == set(cases.OUTSIDE) - {truths.DOTS}
+
+
 def test_a_program_that_fails_is_said(tmp_path):
     program = tmp_path / "program"
     program.write_text("#!/bin/sh\necho no such device\n")

@@ -100,8 +100,11 @@ def draw_case(
     if null:
         return {"scatter": scatter, "change": {}, "engine": "poisson", "outside": False}
     outside, moved = rng.random(2) < (1 / 5, 1 / 6)
-    special = OUTSIDE if outside else READOUT if moved else {}
-    typical = dict(special) or {**known, **VOLTS, GATES: 1.0}
+    special = dict(OUTSIDE if outside else READOUT if moved else {})
+    if device.channel_stop.dots is not None:
+        # Of a device with dots other dots are a change of its own quantities.
+        special.pop(DOTS, None)
+    typical = special or {**known, **VOLTS, GATES: 1.0}
     engine = "poisson"
     if not special and other != "poisson" and rng.random() < 0.5:
         engine = other

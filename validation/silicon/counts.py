@@ -15,9 +15,11 @@ Hits = tuple[int, int]
 """Cases for which something holds, and cases of which it is asked."""
 
 RESULTS = "silicon_cases"
-NEWEST = tuple(f"proof{n}" for n in range(7, 15))
-"""Sets made after the diagnosis at a2ddae1 (two), dffeb0b, 8d13aae (two), 9848899 and 5b559fd (two); the
-last five hold large changes alone, 'proof11' and 'proof14' of another device."""
+NEWEST = tuple(f"proof{n}" for n in range(7, 18))
+"""Sets made after the diagnosis at a2ddae1 (two), dffeb0b, 8d13aae (two), 9848899, 5b559fd (two),
+3f43782 ('proof16') and e1ad63b ('proof15', 'proof17'); the last eight hold large changes alone,
+'proof11' and 'proof14' of a second device, 'proof16' and 'proof17' of a third, 'proof15' by
+Poisson_CCD."""
 VISIBLE = 8.0
 """Projected SNR from which a change is visible.  Chosen: the goal's; at 16 half as many cases count."""
 
@@ -89,7 +91,11 @@ SILICON_CASES: dict[str, Callable[[Rows], str]] = (
         f"silicon class {short}": lambda r, e=engine: said(
             _by_engine(of_sets(r), e)["class"]
         )
-        for short, engine in (("solver", "poisson"), ("images", "image charge"))
+        for short, engine in (
+            ("solver", "poisson"),
+            ("images", "image charge"),
+            ("program", "poisson_ccd"),
+        )
     }
     | {
         "silicon seconds": lambda r: f"{np.median(of_sets(r)['cpu_s']):.0f}",

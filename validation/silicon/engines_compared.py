@@ -3,8 +3,8 @@
 ``python -m validation.silicon.engines_compared BINARY KEPT`` changes one quantity of ITL's device at a
 time, solves both devices by both, and writes ``validation/results/engines_compared.ecsv``.  Poisson_CCD
 takes a minute of CPU for a device; its a_ij go to the folder KEPT by the text of the configuration, and
-what is there is not run again.  A row 'nothing' is the program's own noise: other random steps.  Rows
-with image charges under 'numerics' hold that engine's changes of the quantities that it has, as 'theirs'.
+what is there is not run again.  A row 'nothing' is the program's own noise: other random steps.
+Rows with image charges under 'numerics' hold that engine's changes, of what it has, as 'theirs'.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ NUMERICS = {
 as many sweeps, and with half the charge above the background."""
 
 BLUE = 400.0
-"""Wavelength [nm] of light by image charges.  Published: it is absorbed within 0.3 um of the back surface,
-where the others' light converts; at 500 nm, within 1.5 um, changes differ by less than 0.01 %."""
+"""Wavelength [nm] of light by image charges.  Published: it is absorbed within 0.3 um of the back
+surface, where the others' light converts; at 500 nm (1.5 um) changes differ by less than 0.01 %."""
 
 
 def ours(kept: Path, device: Device) -> Array:
