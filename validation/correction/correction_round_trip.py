@@ -241,8 +241,7 @@ def spectra(
     n, step = 32, level / steps
     spectrum, answer = np.zeros((2, n, n))
     for k in range(steps):
-        at = 0.0 if linear else (k + 0.5) * step
-        a = quadrant_shifts(table_of(device), background=at, tail_slope=None).areas
+        a = _areas(device, 0.0 if linear else (k + 0.5) * step)
         lag = np.minimum(np.arange(n), n - np.arange(n))
         wide = np.zeros((n // 2 + 1,) * 2)
         wide[: len(a), : len(a)] = a
@@ -250,6 +249,12 @@ def spectra(
         spectrum = spectrum * np.exp(2 * grown) + step * _mean_growth(2 * grown)
         answer = answer * np.exp(grown) + step / level * _mean_growth(grown)
     return spectrum, answer
+
+
+@lru_cache(maxsize=1)
+def _areas(device: str, background: float) -> NDArray:
+    """Area changes [1/e-] of a quadrant on a background [e-]; linear spectra ask for one alone."""
+    return quadrant_shifts(table_of(device), background=background, tail_slope=None).areas
 
 
 def _mean_growth(exponent: NDArray) -> NDArray:

@@ -215,7 +215,7 @@ def test_light_that_fluctuates_leaves_no_texture() -> None:
     side, correlation, noise = 192, 14.0, 3e-3
     width, margin = correlation / np.sqrt(2.0), 40
     pulls = []
-    for _ in range(12):
+    for _ in range(6):
         maps = MapChannels((side, side), {HERE: 16.0})
         flats = noise * rng.standard_normal((4, side, side))
         for image in flats:
@@ -229,6 +229,6 @@ def test_light_that_fluctuates_leaves_no_texture() -> None:
         texture = channel.axes["what"] == "texture"
         only = np.where(texture, channel.values, 0.0)
         pulls.append(channel.whiten(only)[texture])
-    assert np.square(pulls).mean() == pytest.approx(1.0, abs=0.2)
-    # Without the flats' differences numbers of four pixels are 4 errors off; 12 means have 0.3.
-    assert np.abs(np.mean(pulls, axis=0)).max() < 1.2
+    assert np.square(pulls).mean() == pytest.approx(1.0, abs=0.4)
+    # Without the flats' differences numbers of four pixels are 4 errors off; 6 means have 0.4.
+    assert np.abs(np.mean(pulls, axis=0)).max() < 2.0
