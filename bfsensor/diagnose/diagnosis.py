@@ -26,6 +26,7 @@ from bfsensor.diagnose.fit.baseline_fit import (
 from bfsensor.diagnose.fit.error_scale import scale_errors
 from bfsensor.diagnose.model.baseline import Baseline
 from bfsensor.diagnose.model.device_baseline import STRAIGHT, expand_at, far_from_solution
+from bfsensor.diagnose.model.device_solver import OXIDES
 from bfsensor.diagnose.model.predictor import Predictor
 from bfsensor.diagnose.model.unknown_level import NAME as LEVEL_NAME
 from bfsensor.diagnose.model.unknown_level import float_unknown_level
@@ -194,10 +195,10 @@ def diagnose_measured(
             more += attribution.notes
             advised = plan(attribution)
             more += advised.notes
-    if attribution is None:
-        more += _not_expanded(predictor.baseline, fit)
-    else:
-        more += _not_expanded(attribution.predictor.baseline, attribution.fit)
+    last = (predictor.baseline, fit)
+    if attribution is not None:
+        last = (attribution.predictor.baseline, attribution.fit)
+    more += [*_not_expanded(*last), *_as_one_film(*last)]
     return Diagnosis(
         campaign=campaign,
         baseline=baseline.name,
@@ -278,6 +279,20 @@ def _not_expanded(baseline: Baseline, fit: BaselineFit) -> list[str]:
         f"{STRAIGHT:g} of their uncertainties from where it was solved, as no such device could be "
         f"solved or {EXPANDED} solutions did not settle: a curved response may look like other physics, "
         "and no quantity is stated"
+    ]
+
+
+def _as_one_film(baseline: Baseline, fit: BaselineFit) -> list[str]:
+    """Note on a field oxide that is fitted thinner than the gate oxide, and solved as thick as that."""
+    if baseline.solver is None:
+        return []
+    change = {n: fit.pulls[n] * baseline.spread[n] for n in OXIDES if n in fit.pulls}
+    gate, field = (baseline.solver.nominal(n) + change.get(n, 0.0) for n in OXIDES)
+    if not change or field >= gate:
+        return []
+    return [
+        f"the field oxide is fitted as {field:.3g} um, thinner than the gate oxide of {gate:.3g} um, "
+        "which no device has: it was solved as thick as the gate oxide; do not rely on its value"
     ]
 
 

@@ -1,9 +1,12 @@
 """Ranges of the quantities of a device that a diagnosis fits."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from bfsensor import Device
+from bfsensor.diagnose import diagnosis
 from bfsensor.diagnose.model.device_solver import DeviceSolver
 from bfsensor.errors import DeviceError
 
@@ -49,3 +52,17 @@ def test_a_field_oxide_is_at_least_as_thick_as_the_gate_oxide():
     )
     # Its range ends at the gate oxide where the two are not one film.
     assert solver("itl_sta3800c").range(oxides[1])[0] == pytest.approx(0.1)
+
+
+def test_a_field_oxide_that_is_fitted_thinner_than_the_gate_oxide_is_noted():
+    def noted(gate, field):
+        spread = {"gates.gate_oxide": 0.01, "gates.field_oxide": 0.01}
+        baseline = SimpleNamespace(solver=solver("e2v_ccd250"), spread=spread)
+        pulls = dict(zip(spread, (gate, field), strict=True))
+        return diagnosis._as_one_film(baseline, SimpleNamespace(pulls=pulls))
+
+    assert noted(-0.5, -0.5) == noted(0.0, 1.0) == []
+    (note,) = noted(0.5, -0.5)
+    assert "fitted as 0.145 um, thinner than the gate oxide of 0.155 um" in note
+    nothing = SimpleNamespace(solver=None, spread={})
+    assert diagnosis._as_one_film(nothing, SimpleNamespace(pulls={})) == []
